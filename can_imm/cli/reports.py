@@ -1,0 +1,101 @@
+"""What ``detect`` and ``replay`` keep of the detector's reports: CSV rows and lane changes."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+from can_imm.runtime.nodes import Reports
+from can_imm.types import Manoeuvre
+
+MODES = [manoeuvre for manoeuvre in Manoeuvre if manoeuvre is not Manoeuvre.UNKNOWN]
+COLUMNS = [
+    *"time_s object_id manoeuvre probability lane direction x vx y vy".split(),
+    *(f"p_{mode.name.lower()}" for mode in MODES),
+]
+DIRECTION = {-1: "right", 0: "", 1: "left"}
+
+
+def seconds(t_ns: int) -> str:
+    """``t_ns`` as seconds with microseconds, without the rounding of a float."""
+    sign = "-" if t_ns < 0 else ""
+    whole, rest = divmod(abs(t_ns) // 1000, 1_000_000)
+    return f"{sign}{whole}.{rest:06d}"
+
+
+class ReportCsv:
+    """Writes one row per object and scan; the rows are on disk after every scan."""
+
+    def __init__(self, path: str) -> None:
+        self._file: TextIO = Path(path).open("w", newline="")  # noqa: SIM115
+        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._writer.writerow(COLUMNS)
+
+    def __call__(self, t_ns: int, reports: Reports) -> None:
+        for report in reports:
+            x = report["x"]
+            self._writer.writerow(
+                [
+                    seconds(int(report["t_ns"])),
+                    report["object_id"],
+                    Manoeuvre(report["manoeuvre"]).name,
+                    f"{report['probability']:.4f}",
+                    report["lane"],
+                    DIRECTION[int(report["direction"])],
+                    *(f"{value:.4f}" for value in x),
+                    *(f"{report['p'][mode]:.4f}" for mode in MODES),
+                ]
+            )
+
+    def close(self) -> None:
+        self._file.close()
+
+
+@dataclass
+class LaneChange:
+    """One uninterrupted stretch of LANE_CHANGE of one object."""
+
+    object_id: int
+    first_ns: int
+    last_ns: int
+    direction: int
+
+
+class LaneChanges:
+    """Collects the lane changes out of the reports."""
+
+    def __init__(self) -> None:
+        self.found: list[LaneChange] = []
+        self._open: dict[int, LaneChange] = {}
+
+    def __call__(self, t_ns: int, reports: Reports) -> None:
+        seen = set()
+        for report in reports:
+            if report["manoeuvre"] != Manoeuvre.LANE_CHANGE:
+                continue
+            name = int(report["object_id"])
+            seen.add(name)
+            change = self._open.get(name)
+            if change is None:
+                change = LaneChange(name, int(report["t_ns"]), 0, 0)
+                self._open[name] = change
+                self.found.append(change)
+            change.last_ns = int(report["t_ns"])
+            change.direction = int(report["direction"]) or change.direction
+        for name in self._open.keys() - seen:
+            del self._open[name]
+
+
+class Totals:
+    """Counts reports: scans answered and different objects."""
+
+    def __init__(self) -> None:
+        self.scans = 0
+        self.object_ids: set[int] = set()
+
+    def __call__(self, t_ns: int, reports: Reports) -> None:
+        self.scans += 1
+        self.object_ids.update(int(name) for name in reports["object_id"])

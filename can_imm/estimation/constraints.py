@@ -1,0 +1,148 @@
+"""State constraints: projection, truncation to intervals, Gaussian interval masses.
+
+Soft equality constraints need no kernel of their own: a row with value d and variance r is a
+pseudo-measurement, `kalman.update_state_`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from can_imm.types import FloatArray
+
+SQRT_2 = math.sqrt(2.0)
+LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
+LOG_MASS_FLOOR = -60.0
+"""Smallest log mass that is told apart: exp(-60) of a Gaussian is 10.6 sigma away."""
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def log_upper_tail(a: float) -> float:  # pragma: no cover - compiled
+    """log P(u > a) of a standard normal u, accurate in both tails."""
+    if a < 5.0:
+        return math.log(0.5 * math.erfc(a / SQRT_2))
+    # Asymptotic series of the Mills ratio; relative error below 1e-7 from a = 5 on.
+    b = 1.0 / (a * a)
+    series = 1.0 - b * (1.0 - 3.0 * b * (1.0 - 5.0 * b * (1.0 - 7.0 * b * (1.0 - 9.0 * b))))
+    return -0.5 * a * a - LOG_SQRT_2PI - math.log(a) + math.log(series)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def truncated_normal(
+    lower: float, upper: float
+) -> tuple[float, float, float]:  # pragma: no cover - compiled
+    """Log mass, mean and variance of a standard normal restricted to [lower, upper].
+
+    Either bound may be infinite.  Below a log mass of `LOG_MASS_FLOOR` the log mass is clipped there
+    and the moments are those of the point of the interval that is nearest to 0.
+    """
+    flip = False
+    if lower > -np.inf and (upper == np.inf or lower + upper > 0.0):
+        a, b = lower, upper
+    else:
+        a, b = -upper, -lower
+        flip = True
+    # now the interval lies to the right or covers 0, and a is finite unless both bounds are infinite
+    if a == -np.inf:
+        return 0.0, 0.0, 1.0
+    la = log_upper_tail(a)
+    log_mass = la
+    if b < np.inf:
+        gap = log_upper_tail(b) - la
+        rest = -math.expm1(gap)
+        if rest <= 0.0:
+            log_mass = LOG_MASS_FLOOR
+        else:
+            log_mass = la + math.log(rest)
+    if not log_mass > LOG_MASS_FLOOR:
+        point = max(a, 0.0)
+        mean = -point if flip else point
+        return LOG_MASS_FLOOR, mean, 0.0
+    pa = math.exp(-0.5 * a * a - LOG_SQRT_2PI - log_mass)
+    mean = pa
+    second = a * pa
+    if b < np.inf:
+        pb = math.exp(-0.5 * b * b - LOG_SQRT_2PI - log_mass)
+        mean -= pb
+        second -= b * pb
+    variance = max(1.0 + second - mean * mean, 0.0)
+    return log_mass, -mean if flip else mean, variance
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def truncate_(
+    x: FloatArray,
+    P: FloatArray,
+    i0: int,
+    lower: float,
+    upper: float,
+    floor: float,
+    work: FloatArray,
+) -> float:  # pragma: no cover - compiled
+    """Restrict state ``i0`` to [lower, upper]: exact truncated moments, in place.
+
+    The other states follow by their regression on state ``i0`` (Simon 2006, section 7.5.4).
+
+    Args:
+        x: (n,) mean.  P: (n, n) covariance.
+        floor: smallest variance that is left to state ``i0``.
+        work: (>= 1, n) scratch.
+
+    Returns:
+        Log of the mass that the Gaussian had inside, clipped at `LOG_MASS_FLOOR`; NaN (and x, P
+        untouched) if the state's variance is not positive or not finite.
+    """
+    n = x.shape[0]
+    p = P[i0, i0]
+    if not (p > 0.0 and p < np.inf):
+        return np.nan
+    sd = math.sqrt(p)
+    log_mass, mean, variance = truncated_normal((lower - x[i0]) / sd, (upper - x[i0]) / sd)
+    variance = min(max(variance, floor / p), 1.0)
+    for i in range(n):
+        work[0, i] = P[i, i0] / p
+        x[i] += work[0, i] * mean * sd
+    shrink = p * (variance - 1.0)
+    for i in range(n):
+        for j in range(i + 1):
+            v = P[i, j] + work[0, i] * work[0, j] * shrink
+            P[i, j] = v
+            P[j, i] = v
+    return log_mass
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def project_(
+    x: FloatArray, P: FloatArray, i0: int, d: float, floor: float, work: FloatArray
+) -> bool:  # pragma: no cover - compiled
+    """Project onto the hyperplane x[i0] = d with W = P^-1, in place (equations 24 to 28, corrected).
+
+    x <- x - P D'(D P D')^-1 (D x - d) and P <- (I - G D) P (I - G D)' + floor on state ``i0``.
+    Several rows one after the other give the same result as all at once.
+
+    Returns:
+        False (and x, P untouched) if the state's variance is not positive or not finite.
+    """
+    n = x.shape[0]
+    p = P[i0, i0]
+    if not (p > 0.0 and p < np.inf):
+        return False
+    e = x[i0] - d
+    for i in range(n):
+        work[0, i] = P[i, i0] / p
+    for i in range(n):
+        x[i] -= work[0, i] * e
+    for i in range(n):
+        for j in range(i + 1):
+            v = P[i, j] - work[0, i] * p * work[0, j]
+            P[i, j] = v
+            P[j, i] = v
+    x[i0] = d
+    for i in range(n):
+        P[i, i0] = 0.0
+        P[i0, i] = 0.0
+    P[i0, i0] = floor
+    return True

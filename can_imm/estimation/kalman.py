@@ -1,0 +1,127 @@
+"""Kalman filter kernels: in place, allocation-free, one measured component at a time.
+
+Every measurement and every pseudo-measurement of the system has a diagonal noise covariance, so
+the vector update is done as a sequence of scalar ones.  That is algebraically the same (Bar-Shalom,
+Li, Kirubarajan 2001, section 7.2), needs no matrix inverse and skips a missing component for free.
+Each scalar update uses the Joseph form, so P stays symmetric and positive semi-definite.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from can_imm.types import FloatArray
+
+LOG_2PI = math.log(2.0 * math.pi)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def log_normal(e: float, s: float) -> float:  # pragma: no cover - compiled
+    """Log density of a normal deviate ``e`` with variance ``s``."""
+    return -0.5 * (LOG_2PI + math.log(s) + e * e / s)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def predict_(
+    x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, work: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """Time update in place: x <- F x, P <- F P F' + Q.
+
+    Args:
+        x: (n,) mean.  P: (n, n) covariance.
+        F: (n, n) transition.  Q: (n, n) process noise.
+        work: (n + 1, n) scratch.
+    """
+    n = x.shape[0]
+    for i in range(n):
+        s = 0.0
+        for k in range(n):
+            s += F[i, k] * x[k]
+        work[n, i] = s
+        for j in range(n):
+            s = 0.0
+            for k in range(n):
+                s += F[i, k] * P[k, j]
+            work[i, j] = s
+    for i in range(n):
+        x[i] = work[n, i]
+        for j in range(i + 1):
+            s = Q[i, j]
+            for k in range(n):
+                s += work[i, k] * F[j, k]
+            P[i, j] = s
+            P[j, i] = s
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def update_row_(
+    x: FloatArray, P: FloatArray, h: FloatArray, z: float, r: float, work: FloatArray
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Scalar measurement z = h x + v, v ~ N(0, r), in place in Joseph form.
+
+    Args:
+        x: (n,) mean.  P: (n, n) covariance.
+        h: (n,) measurement row.  z: measured value.  r: its variance, >= 0.
+        work: (>= 2, n) scratch.
+
+    Returns:
+        Innovation z - h x and its variance h P h' + r; the variance is NaN (and x, P untouched) if
+        it would not be positive and finite.
+    """
+    n = x.shape[0]
+    s = r
+    e = z
+    for i in range(n):
+        a = 0.0
+        for k in range(n):
+            a += P[i, k] * h[k]
+        work[0, i] = a
+        s += h[i] * a
+        e -= h[i] * x[i]
+    if not (s > 0.0 and s < np.inf and abs(e) < np.inf):
+        return e, np.nan
+    for i in range(n):
+        work[1, i] = work[0, i] / s
+        x[i] += work[1, i] * e
+    # Joseph form for one row: P - K (hP) - (hP)' K' + K s K' with K = hP/s, kept symmetric.
+    for i in range(n):
+        for j in range(i + 1):
+            v = (
+                P[i, j]
+                - work[1, i] * work[0, j]
+                - work[0, i] * work[1, j]
+                + work[1, i] * s * work[1, j]
+            )
+            P[i, j] = v
+            P[j, i] = v
+    return e, s
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def update_state_(
+    x: FloatArray, P: FloatArray, i0: int, z: float, r: float, work: FloatArray
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """`update_row_` for a row that selects the single state ``i0``; several times cheaper."""
+    n = x.shape[0]
+    s = P[i0, i0] + r
+    e = z - x[i0]
+    if not (s > 0.0 and s < np.inf and abs(e) < np.inf):
+        return e, np.nan
+    for i in range(n):
+        work[0, i] = P[i, i0]
+        work[1, i] = P[i, i0] / s
+        x[i] += work[1, i] * e
+    for i in range(n):
+        for j in range(i + 1):
+            v = (
+                P[i, j]
+                - work[1, i] * work[0, j]
+                - work[0, i] * work[1, j]
+                + work[1, i] * s * work[1, j]
+            )
+            P[i, j] = v
+            P[j, i] = v
+    return e, s

@@ -1,0 +1,208 @@
+"""Feeds give a loop the frames of one step at a time: from a bus, from a log, or none.
+
+Step k lies at ``t_k = k * step`` of the bus clock and owns the frames with
+``t_(k-1) < t <= t_k``.  A frame that turns up when its step is over is given the time
+``t_(last step) + 1 us``, which makes it the next step's.  The recorder writes that time, so a
+replay of the recording deals out the same frames to the same steps.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator
+from typing import Protocol
+
+from can_imm.bus.frame import Frame
+from can_imm.runtime.clock import JUMP_NS, Clock
+from can_imm.runtime.health import Health
+
+LATE_NS = 1000
+"""How far after the last step [ns] a late frame is put: the resolution of a candump log."""
+
+GUARD_NS = 2_000_000
+"""How long after ``t_k`` [ns] a live step waits for frames that are still on their way."""
+
+
+class Feed(Protocol):
+    """Frames for a loop, step by step."""
+
+    clock: Clock
+    guard_ns: int
+
+    def start_ns(self, step_ns: int) -> int:
+        """Return the time of the first step [ns], a multiple of ``step_ns``; called once."""
+
+    def collect(self, t_ns: int) -> list[Frame] | None:
+        """Wait until step ``t_ns`` is due and return its frames; None when no more will come."""
+
+    def next_ns(self) -> int:
+        """Return the earliest time [ns] at which a further step can have anything to do."""
+
+
+class FrameSource(Protocol):
+    """A live bus to receive from."""
+
+    def recv(self, timeout_s: float) -> Frame | None:
+        """Return the next frame, or None after ``timeout_s`` seconds."""
+
+
+class BusFeed:
+    """Frames of a live bus.
+
+    Frame times are taken as they come where they agree with the clock (socketcan, udp_multicast
+    and virtual stamp with Unix time).  Where they do not - hardware that counts from its own start,
+    or a clock that was set - the difference is taken from the first such frame and then follows
+    the fastest frames, rising by 1 us per frame so that two drifting clocks stay together.
+
+    Args:
+        source: the bus.
+        clock: bus time.
+        health: counters to keep.
+        guard_ns: how long after a step's time to wait for frames on their way [ns].
+    """
+
+    def __init__(
+        self, source: FrameSource, clock: Clock, health: Health, guard_ns: int = GUARD_NS
+    ) -> None:
+        self.clock = clock
+        self._source = source
+        self._health = health
+        self.guard_ns = guard_ns
+        self._pending: deque[Frame] = deque()
+        self._done_ns = 0
+        self._offset_ns = 0
+        self._foreign = False
+
+    def start_ns(self, step_ns: int) -> int:
+        self._done_ns = self.clock.now_ns() // step_ns * step_ns
+        return self._done_ns
+
+    def collect(self, t_ns: int) -> list[Frame]:
+        due_ns = t_ns + self.guard_ns
+        while True:
+            remaining_s = self.clock.remaining_s(due_ns)
+            frame = self._source.recv(max(remaining_s, 0.0))
+            if frame is None:
+                if remaining_s <= 0:
+                    break
+                continue
+            frame = self._on_bus_time(frame)
+            self._pending.append(frame)
+            # When late, read on only as far as this step goes: what follows is later still.
+            if remaining_s <= 0 and frame.t_ns > t_ns:
+                break
+        self._done_ns = t_ns
+        mine = [frame for frame in self._pending if frame.t_ns <= t_ns]
+        if mine:
+            self._pending = deque(frame for frame in self._pending if frame.t_ns > t_ns)
+        return mine
+
+    def next_ns(self) -> int:
+        return self._pending[0].t_ns if self._pending else self.clock.now_ns()
+
+    def _on_bus_time(self, frame: Frame) -> Frame:
+        now_ns = self.clock.now_ns()
+        t_ns = frame.t_ns + self._offset_ns
+        if not self._done_ns - JUMP_NS <= t_ns <= now_ns + JUMP_NS:
+            if self._foreign:
+                self._health.clock_jumps += 1
+            self._foreign = True
+            self._offset_ns = now_ns - frame.t_ns
+            t_ns = now_ns
+        elif self._foreign:
+            self._offset_ns = min(now_ns - frame.t_ns, self._offset_ns + 1000)
+            t_ns = frame.t_ns + self._offset_ns
+        t_ns = min(t_ns, now_ns)
+        if t_ns <= self._done_ns:
+            self._health.late_frames += 1
+            t_ns = self._done_ns + LATE_NS
+        return frame if t_ns == frame.t_ns else frame._replace(t_ns=t_ns)
+
+
+class LogFeed:
+    """Frames of a log, in the log's own time.
+
+    Time that runs backwards by more than a drift (two logs in one file) continues where it was.
+
+    Args:
+        frames: the log.
+        clock: `FastClock` or `PacedClock`.
+        health: counters to keep.
+        replaced: ids whose frames are left out, because the loop makes them anew; they still count
+            as time that passed.
+    """
+
+    def __init__(
+        self,
+        frames: Iterable[Frame],
+        clock: Clock,
+        health: Health,
+        replaced: frozenset[int] = frozenset(),
+    ) -> None:
+        self.clock = clock
+        self.guard_ns = 0
+        self.n_replaced = 0
+        self._frames = iter(frames)
+        self._health = health
+        self._replaced = replaced
+        self._offset_ns = 0
+        self._next = next(self._frames, None)
+        self._earliest_ns = 0 if self._next is None else self._next.t_ns
+
+    def start_ns(self, step_ns: int) -> int:
+        self._earliest_ns = self._earliest_ns // step_ns * step_ns
+        return self._earliest_ns
+
+    def collect(self, t_ns: int) -> list[Frame] | None:
+        if self._next is None:
+            return None
+        while (remaining_s := self.clock.remaining_s(t_ns)) > 0:
+            time.sleep(remaining_s)
+        mine = []
+        frame: Frame | None = self._next
+        while frame is not None and frame.t_ns <= t_ns:
+            if frame.id in self._replaced:
+                self.n_replaced += 1
+            else:
+                mine.append(frame)
+            frame = self._read()
+        self._next = frame
+        self._earliest_ns = t_ns + LATE_NS
+        return mine
+
+    def next_ns(self) -> int:
+        return 0 if self._next is None else self._next.t_ns
+
+    def _read(self) -> Frame | None:
+        frame = next(self._frames, None)
+        if frame is None:
+            return None
+        t_ns = frame.t_ns + self._offset_ns
+        if t_ns < self._earliest_ns - JUMP_NS:
+            self._health.clock_jumps += 1
+            self._offset_ns += self._earliest_ns - t_ns
+            t_ns = self._earliest_ns
+        elif t_ns < self._earliest_ns:
+            self._health.late_frames += 1
+            t_ns = self._earliest_ns
+        return frame if t_ns == frame.t_ns else frame._replace(t_ns=t_ns)
+
+
+class IdleFeed:
+    """No frames, only the passing of time: for a node that sends and does not listen."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+        self.guard_ns = 0
+
+    def start_ns(self, step_ns: int) -> int:
+        return -(-self.clock.now_ns() // step_ns) * step_ns
+
+    def collect(self, t_ns: int) -> list[Frame]:
+        while (remaining_s := self.clock.remaining_s(t_ns)) > 0:
+            time.sleep(remaining_s)
+        return []
+
+    def next_ns(self) -> int:
+        return self.clock.now_ns()

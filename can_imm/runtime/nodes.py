@@ -1,0 +1,131 @@
+"""The nodes: a sender that plays scans, and the detector that answers to them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy.typing as npt
+
+from can_imm.bus.encoder import StatusValues
+from can_imm.bus.frame import Frame
+from can_imm.runtime.health import Health
+from can_imm.types import Scan
+
+STATUS_PERIOD_NS = 100_000_000
+"""Cycle time of DetectorStatus [ns], as the DBC states it."""
+
+SENSOR_TIMEOUT_NS = 1_000_000_000
+"""After so long without a scan [ns] the heartbeat says that there is no sensor."""
+
+MAX_WAITING = 8
+"""Scans that may wait for their step when several come at once."""
+
+Reports = npt.NDArray[Any]
+"""Structured array of `can_imm.types.REPORT_DTYPE`."""
+
+Listener = Callable[[int, Reports], None]
+"""Called after each scan with the step's time [ns] and the detector's reports.  The array is the
+detector's own buffer and holds good until the next step."""
+
+
+class ScanEncoder(Protocol):
+    def encode(self, scan: Scan, t_ns: int) -> list[Frame]: ...
+
+
+class ScanPlayer(Protocol):
+    def step(self, t_ns: int) -> Scan | None: ...
+
+
+class SenderNode:
+    """Sends the scans of a player as frames, when they are due."""
+
+    def __init__(self, player: ScanPlayer, encoder: ScanEncoder) -> None:
+        self._player = player
+        self._encoder = encoder
+
+    def step(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
+        scan = self._player.step(t_ns)
+        return [] if scan is None else self._encoder.encode(scan, t_ns)
+
+
+class DetectorNode:
+    """Frames in, manoeuvre frames out: decodes scans, steps the detector, encodes its reports.
+
+    Args:
+        decoder: finds the scans in the frames.
+        detector: judges them.
+        encoder: writes the answers; one per node, for its alive counters.
+        health: the loop's counters, published in DetectorStatus.
+        listeners: called with the reports after each scan.
+    """
+
+    def __init__(
+        self,
+        decoder: ScanDecoder,
+        detector: Detector,
+        encoder: ManoeuvreEncoder,
+        health: Health,
+        listeners: Sequence[Listener] = (),
+    ) -> None:
+        self.decoder = decoder
+        self.detector = detector
+        self._encoder = encoder
+        self._health = health
+        self._listeners = listeners
+        # The decoder reuses its scan, and the detector takes one per step: the rest waits in copies.
+        self._free = [Scan(decoder.capacity) for _ in range(MAX_WAITING)]
+        self._waiting: deque[Scan] = deque()
+        self._dropped_scans = 0
+        self._seen_ns: int | None = None
+        self._status_ns: int | None = None
+
+    def step(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
+        for frame in frames:
+            self._queue(self.decoder.feed(frame))
+        self._queue(self.decoder.flush(t_ns))
+        scan = self._waiting.popleft() if self._waiting else None
+        n = self.detector.step(t_ns, scan)
+        answers: list[Frame] = []
+        if scan is not None:
+            self._free.append(scan)
+            self._seen_ns = t_ns
+            reports = self.detector.reports[:n]
+            answers += self._encoder.encode(reports, t_ns)
+            for listener in self._listeners:
+                listener(t_ns, reports)
+        if self._status_ns is None or t_ns >= self._status_ns + STATUS_PERIOD_NS:
+            self._status_ns = t_ns
+            answers.append(self._encoder.status(t_ns, self._status(t_ns)))
+        return answers
+
+    @property
+    def dropped_scans(self) -> int:
+        """Scans that never reached the estimators: lost on the way, or too many at once."""
+        return self._dropped_scans
+
+    def _queue(self, scan: Scan | None) -> None:
+        if scan is None:
+            return
+        if not self._free:
+            self._dropped_scans += 1
+            return
+        copy = self._free.pop()
+        copy.copy_from(scan)
+        self._waiting.append(copy)
+
+    def _status(self, t_ns: int) -> StatusValues:
+        if self._seen_ns is None:
+            state = State.STARTING
+        elif t_ns - self._seen_ns > SENSOR_TIMEOUT_NS:
+            state = State.NO_SENSOR
+        else:
+            state = State.RUNNING
+        return StatusValues(
+            state=state,
+            objects_tracked=self.detector.n_tracked,
+            deadline_misses=self._health.deadline_misses,
+            frames_rejected=self.decoder.counts.rejected,
+            dropped_scans=self.dropped_scans,
+        )
