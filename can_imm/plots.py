@@ -312,6 +312,7 @@ def confusion(directory: Path, name: str, title: str, counts: npt.NDArray[np.int
 @mpl.rc_context(_STYLE)
 def comparison(
     directory: Path,
+    name: str,
     title: str,
     systems: Sequence[str],
     error_rate: FloatArray,
@@ -348,4 +349,4 @@ def comparison(
             )
         axes.margins(x=0.28)
     figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-    return _save(figure, directory, "comparison")
+    return _save(figure, directory, name)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import cantools
 
+from can_imm.bus.errors import one_line
 from can_imm.types import CanImmError
 
 NOT_AVAILABLE = "NotAvailable"
@@ -56,15 +57,17 @@ def load_dbc(path: Path) -> Any:
     try:
         return cantools.database.load_file(str(path), database_format="dbc", strict=True)
     except OSError as error:
-        raise CanImmError(f"{path}: {error.strerror or error}") from error
-    except (cantools.database.Error, cantools.database.UnsupportedDatabaseFormatError) as error:
-        raise CanImmError(f"{path}: not a valid DBC: {str(error).splitlines()[0]}") from error
-    except UnicodeDecodeError as error:
-        raise CanImmError(f"{path}: not a valid DBC: {error}") from error
+        raise CanImmError(f"{path}: {one_line(error)}") from error
+    except Exception as error:  # cantools lets errors of its parser's making through
+        raise CanImmError(f"{path}: not a valid DBC: {one_line(error)}") from error
 
 
 def find_signal(message: Any, name: str, where: Path, dbc: Path) -> Any:
-    """The signal called ``name``; CanImmError naming ``where`` if there is none that we can read."""
+    """The signal called ``name``.
+
+    Raises:
+        CanImmError: there is none, or not one that we can read; the line names ``where``.
+    """
     try:
         signal = message.get_signal_by_name(name)
     except KeyError:
@@ -81,12 +84,11 @@ def find_signal(message: Any, name: str, where: Path, dbc: Path) -> Any:
 def field(signal: Any) -> Field:
     """Scaling, range and "not available" code of a cantools signal."""
     bits = signal.length
-    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signal.is_signed else (0, (1 << bits) - 1)
+    low = -(1 << bits - 1) if signal.is_signed else 0
+    high = low + (1 << bits) - 1
     scale, offset = float(signal.scale), float(signal.offset)
     ends = [
-        (limit - offset) / scale
-        for limit in (signal.minimum, signal.maximum)
-        if limit is not None
+        (limit - offset) / scale for limit in (signal.minimum, signal.maximum) if limit is not None
     ]
     if len(ends) == 2:
         # the tolerance absorbs the rounding of limits like 0.07 * 1000
@@ -116,7 +118,8 @@ def compile_reader(message: Any, signals: Sequence[Any]) -> Reader:
             value = f"(({value} ^ {sign}) - {sign})"
         values.append(value)
     lines = [f" {word} = from_bytes(data, {word!r})" for word in sorted(words)]
-    source = "\n".join(["def read(data):", *lines, f" return ({''.join(v + ', ' for v in values)})"])
+    result = "".join(f"{value}, " for value in values)
+    source = "\n".join(["def read(data):", *lines, f" return ({result})"])
     namespace: dict[str, Any] = {"from_bytes": int.from_bytes}
     exec(source, namespace)
     reader: Reader = namespace["read"]

@@ -24,12 +24,12 @@ class DecodeCounts:
 
     Every frame is counted in ``frames`` and in exactly one of ``unknown`` (an id that is not the
     sensor's), ``bad_kind`` (our id, but an extended, FD, remote or error frame), ``bad_length``,
-    ``bad_crc``, ``bad_counter`` (repeated, or no value that a counter takes), ``out_of_range``,
-    ``stray`` (an object without a scan to belong to), ``duplicates`` (an object twice in a scan),
+    ``bad_crc`` (in profile 1 the invalid counter 15, too), ``bad_counter`` (a repeated frame),
+    ``out_of_range``, ``stray`` (an object without a scan to belong to), ``duplicates`` (an object twice in a scan),
     ``overflow`` (more objects than there is room for), ``empty`` (right, but without an object) and
     ``used``. Beside that: ``checksums_ok`` frames with a right checksum, ``lost`` frames missing by
-    their counters, ``not_available`` single values that the sensor did not have, ``scans`` finished,
-    ``incomplete_scans`` of these with an announced object missing or rejected.
+    their counters, ``not_available`` single values that the sensor did not have, ``scans``
+    finished, ``incomplete_scans`` of these with an announced object missing or rejected.
     """
 
     frames: int = 0
@@ -135,11 +135,9 @@ class ScanDecoder:
             for slot, message in enumerate(profile.messages)
         }
 
-        # all object messages are laid out alike as far as scaling goes: that of the first counts
+        # load_profile has made sure that the scaling is the same in all object messages
         first = profile.messages[0]
-        scalings = [
-            field(find_signal(first, name, profile.path, profile.dbc)) for name in names
-        ]
+        scalings = [field(find_signal(first, name, profile.path, profile.dbc)) for name in names]
         self._key = scalings[0]
         self._has_new = profile.new is not None
         self._components = [
@@ -196,10 +194,14 @@ class ScanDecoder:
             if self._is_stale(t_ns, raws[0]):
                 counts.stray += 1
                 return finished
-            if self._open and (raws[0] != self._counter or message.slot in self._seen):
+            if self._open and raws[0] != self._counter:
                 finished = self._finish()
             if not self._open:
                 self._begin(t_ns, raws[0], self._slots)
+            if message.slot in self._seen:
+                counts.duplicates += 1
+                return finished
+            self._seen.add(message.slot)
             self._take_object(message.slot, raws)
         if self._open and self._arrived == self._expected and finished is None:
             finished = self._finish()
@@ -229,9 +231,6 @@ class ScanDecoder:
             return False
         counts.checksums_ok += 1
         counter = guard.counter(data)
-        if counter >= guard.modulus:
-            counts.bad_counter += 1
-            return False
         last = message.last_counter
         if last >= 0 and abs(frame.t_ns - message.last_ns) <= self._resync_ns:
             step = (counter - last) % guard.modulus
@@ -266,12 +265,8 @@ class ScanDecoder:
         self._arrived += 1
         for index, holds in self._conditions:
             if not holds(raws[index]):
-                self._seen.add(key)
                 counts.empty += 1
                 return
-        if self._header and not self._key.low <= key <= self._key.high:
-            self._reject("out_of_range")
-            return
         values = [0.0, 0.0, 0.0, 0.0]
         missing = []
         index = self._first_component
@@ -285,10 +280,14 @@ class ScanDecoder:
             else:
                 self._reject("out_of_range")
                 return
-        if key in self._seen:
-            self._reject("duplicates")
-            return
-        self._seen.add(key)
+        if self._header:
+            if not self._key.low <= key <= self._key.high:
+                self._reject("out_of_range")
+                return
+            if key in self._seen:
+                self._reject("duplicates")
+                return
+            self._seen.add(key)
         counts.not_available += len(missing)
         if len(missing) == len(self._components):
             counts.empty += 1

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import can_imm
-from can_imm.bus.codec import find_signal, load_dbc
+from can_imm.bus.codec import Field, field, find_signal, load_dbc
+from can_imm.bus.errors import one_line
 from can_imm.bus.protection import KINDS, p01_data_id
 from can_imm.types import CanImmError
 
@@ -64,13 +65,13 @@ class Profile:
     id: str | None
     new: str | None
     valid_if: tuple[Condition, ...]
-    state: tuple[Component | None, Component | None, Component | None, Component | None]
+    state: tuple[Component | None, ...]
     protection: str
     protection_counter: str | None
 
 
 def dbc_dir() -> Path:
-    """Folder of the built-in DBC files and profiles: in the installed package, or the checkout's."""
+    """Folder of the built-in DBC files and profiles: the installed package's, or the checkout's."""
     package = Path(can_imm.__file__).parent
     installed = package / "dbc"
     return installed if installed.is_dir() else package.parent / "dbc"
@@ -111,7 +112,7 @@ class _Table:
         # NaN must not pass either
         if not least <= value < 1e6:
             self.fail(f"key {key!r} must lie between {least:g} and 1e6, not {value:g}")
-        return round(value * 1e6)
+        return round(float(value) * 1e6)
 
     def close(self) -> None:
         if self._values:
@@ -133,9 +134,9 @@ def load_profile(name_or_path: str) -> Profile:
     try:
         values = tomllib.loads(path.read_text("utf-8"))
     except OSError as error:
-        raise CanImmError(f"{path}: {error.strerror or error}") from error
+        raise CanImmError(f"{path}: {one_line(error)}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CanImmError(f"{path}: not valid TOML: {error}") from error
+        raise CanImmError(f"{path}: not valid TOML: {one_line(error)}") from error
     return _read(_Table(values, path, ""))
 
 
@@ -161,7 +162,8 @@ def _read(top: _Table) -> Profile:
     if (header is None) != (id_signal is None):
         obj.fail("key 'id' is needed with, and only with, a scan header")
     valid_if = tuple(
-        _condition(_Table(entry, path, "object valid_if")) for entry in obj.take("valid_if", list, [])
+        _condition(_Table(entry, path, "object valid_if"))
+        for entry in obj.take("valid_if", list, [])
     )
     states = obj.table("state")
     obj.close()
@@ -213,7 +215,9 @@ def _messages(table: _Table, database: Any, dbc: Path) -> tuple[Any, ...]:
 
 def _condition(table: _Table) -> Condition:
     condition = Condition(
-        table.take("signal", str), table.take("equals", float, None), table.take("below", float, None)
+        table.take("signal", str),
+        table.take("equals", float, None),
+        table.take("below", float, None),
     )
     table.close()
     if (condition.equals is None) == (condition.below is None):
@@ -244,12 +248,14 @@ def _component(states: _Table, name: str) -> Component | None:
 
 def _check_messages(profile: Profile) -> None:
     """Refuse messages that we cannot decode and signals that are not there."""
-    wanted = [(profile.header.message, (profile.header.count,))] if profile.header else []
+    wanted: list[tuple[Any, tuple[str, ...]]] = []
+    wanted += [(profile.header.message, (profile.header.count,))] if profile.header else []
     names = [profile.id, profile.new, profile.protection_counter]
     names += [condition.signal for condition in profile.valid_if]
     names += [component.signal for component in profile.state if component]
     wanted += [(message, tuple(filter(None, names))) for message in profile.messages]
     counted = {wanted[0][0].name} if profile.header else {m.name for m in profile.messages}
+    fields: dict[tuple[bool, str], Field] = {}
     for message, signals in wanted:
         if message.is_extended_frame or message.is_fd or not 1 <= message.length <= 8:
             raise CanImmError(
@@ -257,6 +263,12 @@ def _check_messages(profile: Profile) -> None:
                 "frame with an 11-bit id: not supported"
             )
         for name in (*signals, *([profile.counter] if message.name in counted else [])):
-            find_signal(message, name, profile.path, profile.dbc)
+            signal = find_signal(message, name, profile.path, profile.dbc)
+            first = fields.setdefault((message in profile.messages, name), field(signal))
+            if field(signal) != first:
+                raise CanImmError(
+                    f"{profile.path}: signal {name!r} of {message.name} has another scale or range "
+                    f"than in {profile.messages[0].name}"
+                )
         if profile.protection == "e2e-p01":
             p01_data_id(message, profile.dbc)

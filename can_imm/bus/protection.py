@@ -59,7 +59,9 @@ def p01_protect(data: bytearray, data_id: int, counter: int) -> None:
     e2e_p01_protect(data, data_id, increment_counter=False)
 
 
-def toyota_guard(frame_id: int, length: int, counter: Callable[[bytes], int], modulus: int) -> Guard:
+def toyota_guard(
+    frame_id: int, length: int, counter: Callable[[bytes], int], modulus: int
+) -> Guard:
     """Toyota's checksum in the last byte: sum of the other bytes, the id's bytes and the length."""
     head = (frame_id & 0xFF) + (frame_id >> 8) + length
     return Guard(lambda data: (sum(data[:-1]) + head) & 0xFF == data[-1], counter, modulus)

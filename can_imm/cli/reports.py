@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
+import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -12,10 +13,18 @@ from can_imm.runtime.nodes import Reports
 from can_imm.types import Manoeuvre
 
 MODES = [manoeuvre for manoeuvre in Manoeuvre if manoeuvre is not Manoeuvre.UNKNOWN]
+STATES = ["x", "vx", "y", "vy"]
 COLUMNS = [
-    *"time_s object_id manoeuvre probability lane direction x vx y vy".split(),
+    "time_s",
+    "object_id",
+    "manoeuvre",
+    "probability",
+    "lane",
+    "direction",
+    *STATES,
     *(f"p_{mode.name.lower()}" for mode in MODES),
 ]
+
 DIRECTION = {-1: "right", 0: "", 1: "left"}
 
 
@@ -27,11 +36,14 @@ def seconds(t_ns: int) -> str:
 
 
 class ReportCsv:
-    """Writes one row per object and scan; the rows are on disk after every scan."""
+    """Writes one row per object and scan to a file, or to standard output if ``path`` is ``-``."""
 
     def __init__(self, path: str) -> None:
-        self._file: TextIO = Path(path).open("w", newline="")  # noqa: SIM115
-        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._stack = ExitStack()
+        file: TextIO = sys.stdout
+        if path != "-":
+            file = self._stack.enter_context(Path(path).open("w", newline=""))  # noqa: SIM115
+        self._writer = csv.writer(file, lineterminator="\n")
         self._writer.writerow(COLUMNS)
 
     def __call__(self, t_ns: int, reports: Reports) -> None:
@@ -51,7 +63,7 @@ class ReportCsv:
             )
 
     def close(self) -> None:
-        self._file.close()
+        self._stack.close()
 
 
 @dataclass
@@ -87,15 +99,3 @@ class LaneChanges:
             change.direction = int(report["direction"]) or change.direction
         for name in self._open.keys() - seen:
             del self._open[name]
-
-
-class Totals:
-    """Counts reports: scans answered and different objects."""
-
-    def __init__(self) -> None:
-        self.scans = 0
-        self.object_ids: set[int] = set()
-
-    def __call__(self, t_ns: int, reports: Reports) -> None:
-        self.scans += 1
-        self.object_ids.update(int(name) for name in reports["object_id"])

@@ -74,6 +74,7 @@ def truncated_normal(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def truncate_(
+    n: int,
     x: FloatArray,
     P: FloatArray,
     i0: int,
@@ -87,6 +88,7 @@ def truncate_(
     The other states follow by their regression on state ``i0`` (Simon 2006, section 7.5.4).
 
     Args:
+        n: number of states; the arrays may be larger, what lies beyond is left alone.
         x: (n,) mean.  P: (n, n) covariance.
         floor: smallest variance that is left to state ``i0``.
         work: (>= 1, n) scratch.
@@ -95,7 +97,6 @@ def truncate_(
         Log of the mass that the Gaussian had inside, clipped at `LOG_MASS_FLOOR`; NaN (and x, P
         untouched) if the state's variance is not positive or not finite.
     """
-    n = x.shape[0]
     p = P[i0, i0]
     if not (p > 0.0 and p < np.inf):
         return np.nan
@@ -116,7 +117,7 @@ def truncate_(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def project_(
-    x: FloatArray, P: FloatArray, i0: int, d: float, floor: float, work: FloatArray
+    n: int, x: FloatArray, P: FloatArray, i0: int, d: float, floor: float, work: FloatArray
 ) -> bool:  # pragma: no cover - compiled
     """Project onto the hyperplane x[i0] = d with W = P^-1, in place (equations 24 to 28, corrected).
 
@@ -126,7 +127,6 @@ def project_(
     Returns:
         False (and x, P untouched) if the state's variance is not positive or not finite.
     """
-    n = x.shape[0]
     p = P[i0, i0]
     if not (p > 0.0 and p < np.inf):
         return False

@@ -23,10 +23,10 @@ from can_imm.estimation.constraints import project_, truncate_
 from can_imm.estimation.kalman import log_normal, predict_, update_row_, update_state_
 from can_imm.estimation.particles import (
     N_COLUMNS,
+    PARTICLE_DTYPE,
     cholesky4_,
     enter_,
     moments_,
-    particle_dtype,
     propagate_,
     resample_,
     weigh_,
@@ -39,89 +39,101 @@ MAX_ROWS = 4
 """Largest number of constraint rows of one kind in one mode."""
 
 FIXED, LANE = 0, 1
-"""Where the value of a soft row comes from: a number, or the nearest lane centre in a range."""
+"""What the numbers of a row refer to: zero, or the nearest lane centre in a range of lanes."""
 
 
-def bank_dtype(n_modes: int, n_states: int, n_steps: int) -> np.dtype[np.void]:
-    """Parameters of a mode bank as one record.
+MAX_MODES = 24
+"""Largest number of modes in a bank."""
 
-    Tables are indexed by the number of elapsed steps: ``F[m]``, ``Q[m]``, ``Pi[m]`` belong to m
-    steps, 0 <= m < n_steps.  ``Pi[m, i, j]`` is the probability of going from mode i to mode j.
-    """
-    m, n, k = n_modes, n_states, MAX_ROWS
-    return np.dtype(
-        [
-            ("F", np.float64, (n_steps, m, n, n)),
-            ("Q", np.float64, (n_steps, m, n, n)),
-            ("Pi", np.float64, (n_steps, m, m)),
-            ("mu0", np.float64, (m,)),
-            ("birth_std", np.float64, (n,)),
-            ("step_s", np.float64),
-            ("mu_floor", np.float64),
-            ("var_floor", np.float64),
-            ("lane_width", np.float64),
-            ("manoeuvre", np.int8, (m,)),
-            ("is_particle", np.int8, (m,)),
-            ("is_projected", np.int8, (m,)),
-            ("n_soft", np.int8, (m,)),
-            ("soft_kind", np.int8, (m, k)),
-            ("soft_state", np.int8, (m, k)),
-            ("soft_value", np.float64, (m, k)),
-            ("soft_upper", np.float64, (m, k)),
-            ("soft_r", np.float64, (m, k)),
-            ("n_bounds", np.int8, (m,)),
-            ("bound_state", np.int8, (m, k)),
-            ("bound_lower", np.float64, (m, k)),
-            ("bound_upper", np.float64, (m, k)),
-            ("bound_mass", np.int8, (m, k)),
-            ("n_entry", np.int8, (m,)),
-            ("entry_state", np.int8, (m, k)),
-            ("entry_mean", np.float64, (m, k)),
-            ("entry_var", np.float64, (m, k)),
-            ("entry_sources", np.int8, (m, m)),
-            ("particle", particle_dtype()),
-        ]
-    )
+MAX_STATES = 6
+"""Largest number of states in a mode."""
 
+MAX_STEPS = 201
+"""Length of the tables over elapsed steps: two seconds of 10 ms."""
 
-def object_dtype(n_modes: int, n_states: int, n_particles: int) -> np.dtype[np.void]:
-    """Estimator state of one object.
+# The records have one fixed layout for all banks.  That spares a compilation per bank, and it has
+# to be so: numba names cached functions after a record's number in the process that compiled them,
+# so two layouts compiled in two processes can be taken for each other in a third.
 
-    ``x``, ``P``, ``mu`` per mode at the last measurement; ``mean``, ``cov`` the combined estimate;
-    ``p`` unused rows of the particle array are those of a bank without particles.
-    """
-    return np.dtype(
-        [
-            ("x", np.float64, (n_modes, n_states)),
-            ("P", np.float64, (n_modes, n_states, n_states)),
-            ("mu", np.float64, (n_modes,)),
-            ("log_l", np.float64, (n_modes,)),
-            ("mean", np.float64, (n_states,)),
-            ("cov", np.float64, (n_states, n_states)),
-            ("nis", np.float64),
-            ("particles", np.float64, (n_particles, N_COLUMNS)),
-        ]
-    )
+_M, _N, _K = MAX_MODES, MAX_STATES, MAX_ROWS
 
+BANK_DTYPE = np.dtype(
+    [
+        ("F", np.float64, (MAX_STEPS, _M, _N, _N)),
+        ("Q", np.float64, (MAX_STEPS, _M, _N, _N)),
+        ("Pi", np.float64, (MAX_STEPS, _M, _M)),
+        ("mu0", np.float64, (_M,)),
+        ("birth_std", np.float64, (_N,)),
+        ("jump_std", np.float64, (4,)),
+        ("step_s", np.float64),
+        ("mu_floor", np.float64),
+        ("var_floor", np.float64),
+        ("lane_width", np.float64),
+        ("soft_value", np.float64, (_M, _K)),
+        ("soft_lanes", np.float64, (_M, _K, 2)),
+        ("soft_r", np.float64, (_M, _K)),
+        ("bound_lower", np.float64, (_M, _K)),
+        ("bound_upper", np.float64, (_M, _K)),
+        ("bound_lanes", np.float64, (_M, _K, 2)),
+        ("entry_mean", np.float64, (_M, _N)),
+        ("entry_var", np.float64, (_M, _N)),
+        ("particle", PARTICLE_DTYPE),
+        ("n_modes", np.int64),
+        ("n_states", np.int64),
+        ("manoeuvre", np.int8, (_M,)),
+        ("direction", np.int8, (_M,)),
+        ("is_particle", np.int8, (_M,)),
+        ("is_projected", np.int8, (_M,)),
+        ("n_soft", np.int8, (_M,)),
+        ("soft_kind", np.int8, (_M, _K)),
+        ("soft_state", np.int8, (_M, _K)),
+        ("n_bounds", np.int8, (_M,)),
+        ("bound_state", np.int8, (_M, _K)),
+        ("bound_kind", np.int8, (_M, _K)),
+        ("bound_mass", np.int8, (_M, _K)),
+        ("entry_sources", np.int8, (_M, _M)),
+    ],
+    align=True,
+)
+"""Parameters of a mode bank as one record.
 
-def work_dtype(n_modes: int, n_states: int, n_particles: int) -> np.dtype[np.void]:
-    """Scratch of the kernels; one record serves all objects."""
-    return np.dtype(
-        [
-            ("x", np.float64, (n_modes, n_states)),
-            ("P", np.float64, (n_modes, n_states, n_states)),
-            ("c", np.float64, (n_modes,)),
-            ("w", np.float64, (n_modes,)),
-            ("sx", np.float64, (n_modes, n_states)),
-            ("tx", np.float64, (n_states,)),
-            ("tP", np.float64, (n_states, n_states)),
-            ("h", np.float64, (n_states,)),
-            ("row", np.float64, (n_states + 1, n_states)),
-            ("L", np.float64, (4, 4)),
-            ("particles", np.float64, (n_particles, N_COLUMNS)),
-            ("pw", np.float64, (n_particles,)),
-        ]
-    )
+Tables are indexed by the number of elapsed steps: ``F[m]``, ``Q[m]``, ``Pi[m]`` belong to m steps;
+``Pi[m, i, j]`` is the probability of going from mode i to mode j.  ``entry_var`` is negative where
+a state is not replaced on entry.
+"""
+
+OBJECT_DTYPE = np.dtype(
+    [
+        ("x", np.float64, (_M, _N)),
+        ("P", np.float64, (_M, _N, _N)),
+        ("mu", np.float64, (_M,)),
+        ("log_l", np.float64, (_M,)),
+        ("mean", np.float64, (_N,)),
+        ("cov", np.float64, (_N, _N)),
+    ],
+    align=True,
+)
+"""Estimator state of one object: per mode at its last measurement, and the combined estimate."""
+
+WORK_DTYPE = np.dtype(
+    [
+        ("x", np.float64, (_M, _N)),
+        ("P", np.float64, (_M, _N, _N)),
+        ("c", np.float64, (_M,)),
+        ("w", np.float64, (_M,)),
+        ("sx", np.float64, (_M, _N)),
+        ("tx", np.float64, (_N,)),
+        ("tP", np.float64, (_N, _N)),
+        ("h", np.float64, (_N,)),
+        ("row", np.float64, (_N + 1, _N)),
+        ("L", np.float64, (4, 4)),
+        ("lower", np.float64, (_K,)),
+        ("upper", np.float64, (_K,)),
+        ("source", np.int64, (_M,)),
+    ],
+    align=True,
+)
+"""Scratch of the kernels; one record serves all objects."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -132,61 +144,56 @@ def mix_(bank: Any, obj: Any, work: Any, j: int) -> None:  # pragma: no cover - 
     entry distribution: what a vehicle that starts this manoeuvre does, not what it did before.
     ``work.w`` holds the mixing weights.
     """
-    n_modes, n = obj.x.shape
-    xj = work.x[j]
-    Pj = work.P[j]
-    for s in range(n):
-        xj[s] = 0.0
-        for t in range(n):
-            Pj[s, t] = 0.0
+    n_modes, n = bank.n_modes, bank.n_states
+    n_sources = 0
+    entering = 0.0
     for i in range(n_modes):
-        if work.w[i] <= 0.0:
-            continue
-        for s in range(n):
-            work.sx[i, s] = obj.x[i, s]
-        if bank.entry_sources[i, j]:
-            for e in range(bank.n_entry[j]):
-                work.sx[i, bank.entry_state[j, e]] = bank.entry_mean[j, e]
-        for s in range(n):
-            xj[s] += work.w[i] * work.sx[i, s]
-    for i in range(n_modes):
-        wi = work.w[i]
-        if wi <= 0.0:
-            continue
-        entered = bank.entry_sources[i, j] and bank.n_entry[j] > 0
-        for s in range(n):
-            ds = work.sx[i, s] - xj[s]
-            for t in range(s + 1):
-                Pj[s, t] += wi * ds * (work.sx[i, t] - xj[t])
-        if not entered:
-            for s in range(n):
-                for t in range(s + 1):
-                    Pj[s, t] += wi * obj.P[i, s, t]
-        else:
-            for s in range(n):
-                vs = -1.0
-                for e in range(bank.n_entry[j]):
-                    if bank.entry_state[j, e] == s:
-                        vs = bank.entry_var[j, e]
-                if vs >= 0.0:
-                    Pj[s, s] += wi * vs
-                    continue
-                for t in range(s + 1):
-                    free = True
-                    for e in range(bank.n_entry[j]):
-                        if bank.entry_state[j, e] == t:
-                            free = False
-                    if free:
-                        Pj[s, t] += wi * obj.P[i, s, t]
+        if work.w[i] > 0.0:
+            work.source[n_sources] = i
+            n_sources += 1
+            if bank.entry_sources[i, j]:
+                entering += work.w[i]
     for s in range(n):
-        for t in range(s):
-            Pj[t, s] = Pj[s, t]
+        replaced = bank.entry_var[j, s] >= 0.0
+        v = 0.0
+        for k in range(n_sources):
+            i = work.source[k]
+            d = obj.x[i, s]
+            if replaced and bank.entry_sources[i, j]:
+                d = bank.entry_mean[j, s]
+            work.sx[k, s] = d
+            v += work.w[i] * d
+        for k in range(n_sources):
+            work.sx[k, s] -= v
+        work.x[j, s] = v
+    for s in range(n):
+        for t in range(s + 1):
+            replaced = bank.entry_var[j, s] >= 0.0 or bank.entry_var[j, t] >= 0.0
+            v = 0.0
+            for k in range(n_sources):
+                i = work.source[k]
+                p = work.sx[k, s] * work.sx[k, t]
+                if not (replaced and bank.entry_sources[i, j]):
+                    p += obj.P[i, s, t]
+                v += work.w[i] * p
+            if replaced and s == t:
+                v += entering * bank.entry_var[j, s]
+            work.P[j, s, t] = v
+            work.P[j, t, s] = v
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def lane_centre(y: float, low: float, high: float, width: float) -> float:  # pragma: no cover
-    """Centre of the lane nearest to ``y`` among the lanes ``low`` .. ``high`` (0 is y = 0)."""
-    return min(max(math.floor(y / width + 0.5), low), high) * width
+def reference(
+    kind: int, lanes: FloatArray, width: float, y: float
+) -> float:  # pragma: no cover - compiled
+    """What a row's numbers count from: 0, or the centre of the lane nearest to ``y``.
+
+    Args:
+        lanes: (2,) lowest and highest number of the lanes that count; lane k lies at k times width.
+    """
+    if kind == FIXED:
+        return 0.0
+    return min(max(math.floor(y / width + 0.5), lanes[0]), lanes[1]) * width
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -199,17 +206,19 @@ def constrain_soft_(
     satisfies the constraint, and has another dimension for each mode.
     """
     bad = 0.0
+    n = bank.n_states
     for c in range(bank.n_soft[j]):
         s = bank.soft_state[j, c]
-        value = bank.soft_value[j, c]
-        if bank.soft_kind[j, c] == LANE:
-            value = lane_centre(x[s], value, bank.soft_upper[j, c], bank.lane_width)
-        bad += 0.0 * update_state_(x, P, s, value, bank.soft_r[j, c], row)[1]
+        value = bank.soft_value[j, c] + reference(
+            bank.soft_kind[j, c], bank.soft_lanes[j, c], bank.lane_width, x[s]
+        )
+        bad += 0.0 * update_state_(n, x, P, s, value, bank.soft_r[j, c], row)[1]
     return bad
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def correct_(
+    n: int,
     x: FloatArray,
     P: FloatArray,
     z: FloatArray,
@@ -218,7 +227,7 @@ def correct_(
     age: float,
     h: FloatArray,
     row: FloatArray,
-) -> tuple[float, float]:  # pragma: no cover - compiled
+) -> float:  # pragma: no cover - compiled
     """Measurement update with the valid components of z, in place.
 
     Args:
@@ -228,18 +237,15 @@ def correct_(
         h: (n,) scratch.  row: (>= 2, n) scratch.
 
     Returns:
-        Log density of z, and its normalised innovation squared; NaN on a numeric failure.
+        Log density of z; NaN on a numeric failure.
     """
-    n = x.shape[0]
     log_l = 0.0
-    nis = 0.0
     for c in range(4):
         if not valid[c]:
             continue
         if age == 0.0:
-            e, v = update_state_(x, P, c, z[c], r[c], row)
+            e, v = update_state_(n, x, P, c, z[c], r[c], row)
             log_l += log_normal(e, v)
-            nis += e * e / v
             continue
         for s in range(n):
             h[s] = 0.0
@@ -251,10 +257,9 @@ def correct_(
                 h[a] = 0.5 * age * age
         elif a < n:
             h[a] = -age
-        e, v = update_row_(x, P, h, z[c], r[c], row)
+        e, v = update_row_(n, x, P, h, z[c], r[c], row)
         log_l += log_normal(e, v)
-        nis += e * e / v
-    return log_l, nis
+    return log_l
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -266,15 +271,11 @@ def update_mode_(
     r: FloatArray,
     valid: Any,
     age: float,
-) -> tuple[float, float]:  # pragma: no cover - compiled
-    """Constraint and measurement update of Gaussian mode j in work.x[j], work.P[j].
-
-    Returns:
-        Log of the mode likelihood, and the normalised innovation squared.
-    """
+) -> float:  # pragma: no cover - compiled
+    """Constraint and measurement update of Gaussian mode j in work.x[j], work.P[j]; its log L."""
     x = work.x[j]
     P = work.P[j]
-    n = x.shape[0]
+    n = bank.n_states
     log_l = constrain_soft_(bank, j, x, P, work.row)
     n_bounds = bank.n_bounds[j]
     prior = 0.0
@@ -284,18 +285,17 @@ def update_mode_(
             for t in range(n):
                 work.tP[s, t] = P[s, t]
         for c in range(n_bounds):
+            s = bank.bound_state[j, c]
+            # The lane is that of the prior, for the posterior too.
+            base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], bank.lane_width, x[s])
+            work.lower[c] = base + bank.bound_lower[j, c]
+            work.upper[c] = base + bank.bound_upper[j, c]
             mass = truncate_(
-                work.tx,
-                work.tP,
-                bank.bound_state[j, c],
-                bank.bound_lower[j, c],
-                bank.bound_upper[j, c],
-                bank.var_floor,
-                work.row,
+                n, work.tx, work.tP, s, work.lower[c], work.upper[c], bank.var_floor, work.row
             )
             if not bank.bound_mass[j, c]:
                 prior += mass
-    log_z, nis = correct_(x, P, z, r, valid, age, work.h, work.row)
+    log_l += correct_(n, x, P, z, r, valid, age, work.h, work.row)
     posterior = 0.0
     if n_bounds > 0 and bank.is_projected[j]:
         # The mass needs the Gaussian before it is projected.
@@ -305,23 +305,22 @@ def update_mode_(
                 work.tP[s, t] = P[s, t]
     for c in range(n_bounds):
         s = bank.bound_state[j, c]
-        lower = bank.bound_lower[j, c]
-        upper = bank.bound_upper[j, c]
+        lower = work.lower[c]
+        upper = work.upper[c]
         if bank.is_projected[j]:
-            posterior += truncate_(work.tx, work.tP, s, lower, upper, bank.var_floor, work.row)
+            posterior += truncate_(n, work.tx, work.tP, s, lower, upper, bank.var_floor, work.row)
             if x[s] < lower:
-                project_(x, P, s, lower, bank.var_floor, work.row)
+                project_(n, x, P, s, lower, bank.var_floor, work.row)
             elif x[s] > upper:
-                project_(x, P, s, upper, bank.var_floor, work.row)
+                project_(n, x, P, s, upper, bank.var_floor, work.row)
         else:
-            posterior += truncate_(x, P, s, lower, upper, bank.var_floor, work.row)
-    return log_l + log_z + posterior - prior, nis
+            posterior += truncate_(n, x, P, s, lower, upper, bank.var_floor, work.row)
+    return log_l + posterior - prior
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def keep_combined_(obj: Any, x: FloatArray, P: FloatArray) -> None:  # pragma: no cover - compiled
+def keep_combined_(n: int, obj: Any, x: FloatArray, P: FloatArray) -> None:  # pragma: no cover - compiled
     """An impossible mode takes over the combined estimate, so that it can start from there."""
-    n = x.shape[0]
     for s in range(n):
         x[s] = obj.mean[s]
         for t in range(n):
@@ -339,6 +338,9 @@ def update_particles_(
     r: FloatArray,
     valid: Any,
     age: float,
+    particles: FloatArray,
+    spare: FloatArray,
+    weights: FloatArray,
     rng: Any,
 ) -> float:  # pragma: no cover - compiled
     """Whole cycle of the particle mode j: interact by drawing from the sources, move, weigh,
@@ -347,8 +349,8 @@ def update_particles_(
     The mass of the window is part of the likelihood: it is a hard region (a state-dependent
     transition), not a soft overlap.
     """
-    n_modes, n = obj.x.shape
-    total = obj.particles.shape[0]
+    n_modes, n = bank.n_modes, bank.n_states
+    total = particles.shape[0]
     x = work.x[j]
     P = work.P[j]
     # Systematic allocation of the particles to the sources; nothing is drawn for a window that
@@ -367,34 +369,34 @@ def update_particles_(
             for k in range(count):
                 a = (k * total) // count
                 for c in range(N_COLUMNS):
-                    work.particles[done + k, c] = obj.particles[a, c]
+                    spare[done + k, c] = particles[a, c]
         else:
             cholesky4_(obj.P[i], work.L)
-            enter_(work.particles, done, count, obj.x[i], work.L, bank.particle, rng)
+            enter_(spare, done, count, obj.x[i], work.L, bank.particle, rng)
         done = upto
-    propagate_(work.particles, m * bank.step_s, bank.particle, rng)
-    log_l = weigh_(work.particles, work.pw, z, r, valid, age, bank.particle)
+    propagate_(spare, m * bank.step_s, bank.particle, rng)
+    log_l = weigh_(spare, weights, z, r, valid, age, bank.particle)
     for s in range(n):
         for t in range(n):
             P[s, t] = 0.0
     if log_l == -np.inf:
         # No particle is feasible; the mode keeps the last moments and the floor probability.
-        keep_combined_(obj, x, P)
+        keep_combined_(n, obj, x, P)
         return LOG_FLOOR
-    moments_(work.particles, work.pw, x, P)
+    moments_(spare, weights, x, P)
     for s in range(4):
         P[s, s] += bank.var_floor
     for s in range(4, n):
         x[s] = 0.0
         P[s, s] = bank.birth_std[s] ** 2
-    resample_(work.particles, work.pw, obj.particles, total, rng.random())
+    resample_(spare, weights, particles, total, rng.random())
     return log_l
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def combine_(obj: Any) -> None:  # pragma: no cover - compiled
+def combine_(bank: Any, obj: Any) -> None:  # pragma: no cover - compiled
     """Combined mean and covariance (19)(20) of all modes."""
-    n_modes, n = obj.x.shape
+    n_modes, n = bank.n_modes, bank.n_states
     for s in range(n):
         v = 0.0
         for j in range(n_modes):
@@ -413,13 +415,14 @@ def combine_(obj: Any) -> None:  # pragma: no cover - compiled
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def normalise_(mu: FloatArray, log_l: FloatArray, c: FloatArray, floor: float) -> bool:
+def normalise_(
+    n: int, mu: FloatArray, log_l: FloatArray, c: FloatArray, floor: float
+) -> bool:  # pragma: no cover - compiled
     """mu_j proportional to exp(log_l_j) c_j with the log-sum-exp shift, then the floor.
 
     Returns:
         False if no mode has a finite likelihood (mu untouched).
     """
-    n = mu.shape[0]
     top = -np.inf
     for j in range(n):
         v = log_l[j] + (math.log(c[j]) if c[j] > 0.0 else LOG_FLOOR)
@@ -445,6 +448,26 @@ OK, OUTLIER, FAILED = 0, 1, 2
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def surprise(
+    bank: Any, obj: Any, m: int, z: FloatArray, r: FloatArray, valid: Any, age: float
+) -> float:  # pragma: no cover - compiled
+    """Squared distance of z from where the object can be, in standard deviations.
+
+    The combined estimate moved on at constant speed, widened by ``jump_std``: how far a vehicle can
+    depart from that between two scans.  It knows no modes: a manoeuvre must never be an outlier.
+    """
+    d = 0.0
+    tau = m * bank.step_s - age
+    for c in range(4):
+        if valid[c]:
+            e = z[c] - obj.mean[c]
+            if c == 0 or c == 2:
+                e -= tau * obj.mean[c + 1]
+            d += e * e / (obj.cov[c, c] + r[c] + bank.jump_std[c] ** 2)
+    return d
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def cycle_(
     bank: Any,
     obj: Any,
@@ -455,57 +478,58 @@ def cycle_(
     valid: Any,
     age: float,
     gate: float,
+    particles: FloatArray,
+    spare: FloatArray,
+    weights: FloatArray,
     rng: Any,
 ) -> int:  # pragma: no cover - compiled
     """One IMM cycle of one object, in place.
 
     Args:
-        bank, obj, work: records of `bank_dtype`, `object_dtype`, `work_dtype`.
+        bank, obj, work: records of `BANK_DTYPE`, `OBJECT_DTYPE`, `WORK_DTYPE`.
         m: steps since the object's last measurement.
         z, r: (4,) measured x, vx, y, vy and their variances.  valid: (4,) bool.
         age: of the measurement [s].
-        gate: z is an outlier if its Mahalanobis distance squared is larger than this in every
-            Gaussian mode; inf switches the gate off.
-        rng: numpy Generator, used by particle modes only.
+        gate: z is an outlier if its `surprise` is larger; inf switches the gate off.
+        particles: (N, 7) the object's particles; N may be 0 in a bank without a particle mode.
+        spare: (N, 7) scratch.  weights: (N,) scratch.
+        rng: numpy Generator, used by the particle mode only.
 
     Returns:
         OK; OUTLIER or FAILED with the object as it was before (a failed mode alone gets the floor).
     """
-    n_modes, n = obj.x.shape
+    n_modes, n = bank.n_modes, bank.n_states
+    if surprise(bank, obj, m, z, r, valid, age) > gate:
+        return OUTLIER
     for j in range(n_modes):
         s = 0.0
         for i in range(n_modes):
             s += bank.Pi[m, i, j] * obj.mu[i]
         work.c[j] = s
-    nearest = np.inf
-    for kind in range(2):  # Gaussian modes first: they decide about outliers
-        for j in range(n_modes):
-            if bank.is_particle[j] != kind:
-                continue
-            for i in range(n_modes):
-                w = bank.Pi[m, i, j] * obj.mu[i] / work.c[j] if work.c[j] > 0.0 else 0.0
-                work.w[i] = w if w > 1e-12 else 0.0
-            log_l = LOG_FLOOR
-            if work.c[j] <= 0.0:
-                keep_combined_(obj, work.x[j], work.P[j])
-            elif bank.is_particle[j]:
-                log_l = update_particles_(bank, obj, work, j, m, z, r, valid, age, rng)
-            else:
-                mix_(bank, obj, work, j)
-                predict_(work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
-                log_l, nis = update_mode_(bank, work, j, z, r, valid, age)
-                nearest = min(nearest, nis)
-            obj.log_l[j] = log_l if log_l > LOG_FLOOR else LOG_FLOOR
-        if nearest > gate:
-            return OUTLIER
-    if not normalise_(obj.mu, obj.log_l, work.c, bank.mu_floor):
+    for j in range(n_modes):
+        for i in range(n_modes):
+            w = bank.Pi[m, i, j] * obj.mu[i] / work.c[j] if work.c[j] > 0.0 else 0.0
+            work.w[i] = w if w > 1e-12 else 0.0
+        log_l = LOG_FLOOR
+        if work.c[j] <= 0.0:
+            keep_combined_(n, obj, work.x[j], work.P[j])
+        elif bank.is_particle[j]:
+            log_l = update_particles_(
+                bank, obj, work, j, m, z, r, valid, age, particles, spare, weights, rng
+            )
+        else:
+            mix_(bank, obj, work, j)
+            predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
+            log_l = update_mode_(bank, work, j, z, r, valid, age)
+        obj.log_l[j] = log_l if log_l > LOG_FLOOR else LOG_FLOOR
+    if not normalise_(n_modes, obj.mu, obj.log_l, work.c, bank.mu_floor):
         return FAILED
     for j in range(n_modes):
         for s in range(n):
             obj.x[j, s] = work.x[j, s]
             for t in range(n):
                 obj.P[j, s, t] = work.P[j, s, t]
-    combine_(obj)
+    combine_(bank, obj)
     return OK
 
 
@@ -519,7 +543,7 @@ def birth_(
     zero speed, with its entry distribution and its constraints applied; so the first probabilities
     are honest ones.
     """
-    n_modes, n = obj.x.shape
+    n_modes, n = bank.n_modes, bank.n_states
     for j in range(n_modes):
         x = work.x[j]
         P = work.P[j]
@@ -528,30 +552,25 @@ def birth_(
             for t in range(n):
                 P[s, t] = 0.0
             P[s, s] = bank.birth_std[s] ** 2
-        for c in range(0, 4, 2):
-            if valid[c]:
-                x[c] = z[c]
-        for e in range(bank.n_entry[j]):
-            s = bank.entry_state[j, e]
-            x[s] = bank.entry_mean[j, e]
-            P[s, s] = bank.entry_var[j, e]
+            if s < 4 and s % 2 == 0 and valid[s]:
+                x[s] = z[s]
+            if bank.entry_var[j, s] >= 0.0:
+                x[s] = bank.entry_mean[j, s]
+                P[s, s] = bank.entry_var[j, s]
         work.c[j] = bank.mu0[j]
-        log_l = update_mode_(bank, work, j, z, r, valid, age)[0]
+        log_l = update_mode_(bank, work, j, z, r, valid, age)
         if bank.is_particle[j]:
             log_l = LOG_FLOOR  # entered from another mode, never born into
         obj.log_l[j] = log_l if log_l > LOG_FLOOR else LOG_FLOOR
         obj.mu[j] = bank.mu0[j]
-    if not normalise_(obj.mu, obj.log_l, work.c, bank.mu_floor):
+    if not normalise_(n_modes, obj.mu, obj.log_l, work.c, bank.mu_floor):
         return FAILED
     for j in range(n_modes):
         for s in range(n):
             obj.x[j, s] = work.x[j, s]
             for t in range(n):
                 obj.P[j, s, t] = work.P[j, s, t]
-    for a in range(obj.particles.shape[0]):
-        for c in range(N_COLUMNS):
-            obj.particles[a, c] = 0.0
-    combine_(obj)
+    combine_(bank, obj)
     return OK
 
 
@@ -562,7 +581,7 @@ def extrapolate_(bank: Any, obj: Any, m: int, x: FloatArray, P: FloatArray, mu: 
     Nothing is mixed and nothing of ``obj`` changes: each mode is predicted on its own, mu moves
     with Pi(m).  Writes x (n,), P (n, n), mu (n_modes,).
     """
-    n_modes, n = obj.x.shape
+    n_modes, n = bank.n_modes, bank.n_states
     for s in range(n):
         x[s] = 0.0
         for t in range(n):
@@ -576,7 +595,7 @@ def extrapolate_(bank: Any, obj: Any, m: int, x: FloatArray, P: FloatArray, mu: 
             work.x[j, s] = obj.x[j, s]
             for t in range(n):
                 work.P[j, s, t] = obj.P[j, s, t]
-        predict_(work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
+        predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
         for s in range(n):
             x[s] += obj.mu[j] * work.x[j, s]
     for j in range(n_modes):
@@ -600,6 +619,9 @@ def process_scan_(
     valid: Any,
     age: float,
     gate: float,
+    particles: FloatArray,
+    spare: FloatArray,
+    weights: FloatArray,
     rng: Any,
     status: Any,
 ) -> None:  # pragma: no cover - compiled
@@ -610,7 +632,8 @@ def process_scan_(
         n: rows in use.  slot: (N,) int32, -1 for none.
         steps: (N,) int32, steps since the slot's last measurement; -1 for a birth.
         z, r: (N, 4) measured values and variances.  valid: (N, 4) bool.
-        age, gate, rng: as for `cycle_`.
+        age, gate, spare, weights, rng: as for `cycle_`.
+        particles: (capacity, n_particles, 7).
         status: (N,) int8, written: OK, OUTLIER or FAILED.
     """
     for k in range(n):
@@ -621,5 +644,17 @@ def process_scan_(
             status[k] = birth_(bank[0], objects[s], work[0], z[k], r[k], valid[k], age)
         else:
             status[k] = cycle_(
-                bank[0], objects[s], work[0], steps[k], z[k], r[k], valid[k], age, gate, rng
+                bank[0],
+                objects[s],
+                work[0],
+                steps[k],
+                z[k],
+                r[k],
+                valid[k],
+                age,
+                gate,
+                particles[s],
+                spare,
+                weights,
+                rng,
             )

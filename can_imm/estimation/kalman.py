@@ -26,16 +26,16 @@ def log_normal(e: float, s: float) -> float:  # pragma: no cover - compiled
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def predict_(
-    x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, work: FloatArray
+    n: int, x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, work: FloatArray
 ) -> None:  # pragma: no cover - compiled
     """Time update in place: x <- F x, P <- F P F' + Q.
 
     Args:
+        n: number of states; every array may be larger, what lies beyond is left alone.
         x: (n,) mean.  P: (n, n) covariance.
         F: (n, n) transition.  Q: (n, n) process noise.
         work: (n + 1, n) scratch.
     """
-    n = x.shape[0]
     for i in range(n):
         s = 0.0
         for k in range(n):
@@ -58,11 +58,12 @@ def predict_(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def update_row_(
-    x: FloatArray, P: FloatArray, h: FloatArray, z: float, r: float, work: FloatArray
+    n: int, x: FloatArray, P: FloatArray, h: FloatArray, z: float, r: float, work: FloatArray
 ) -> tuple[float, float]:  # pragma: no cover - compiled
     """Scalar measurement z = h x + v, v ~ N(0, r), in place in Joseph form.
 
     Args:
+        n: number of states, as in `predict_`.
         x: (n,) mean.  P: (n, n) covariance.
         h: (n,) measurement row.  z: measured value.  r: its variance, >= 0.
         work: (>= 2, n) scratch.
@@ -71,7 +72,6 @@ def update_row_(
         Innovation z - h x and its variance h P h' + r; the variance is NaN (and x, P untouched) if
         it would not be positive and finite.
     """
-    n = x.shape[0]
     s = r
     e = z
     for i in range(n):
@@ -102,10 +102,9 @@ def update_row_(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def update_state_(
-    x: FloatArray, P: FloatArray, i0: int, z: float, r: float, work: FloatArray
+    n: int, x: FloatArray, P: FloatArray, i0: int, z: float, r: float, work: FloatArray
 ) -> tuple[float, float]:  # pragma: no cover - compiled
     """`update_row_` for a row that selects the single state ``i0``; several times cheaper."""
-    n = x.shape[0]
     s = P[i0, i0] + r
     e = z - x[i0]
     if not (s > 0.0 and s < np.inf and abs(e) < np.inf):

@@ -22,6 +22,28 @@ PX, PVX, PY, PVY, ENTRY, PEAK, LENGTH = 0, 1, 2, 3, 4, 5, 6
 N_COLUMNS = 7
 """Columns of the particle array: state, then the particle's own profile."""
 
+PARTICLE_DTYPE = np.dtype(
+    [
+        ("entry", np.float64),
+        ("up", np.float64),
+        ("down", np.float64),
+        ("peak_low", np.float64),
+        ("peak_high", np.float64),
+        ("length_low", np.float64),
+        ("length_high", np.float64),
+        ("f_min", np.float64),
+        ("y_low", np.float64),
+        ("y_high", np.float64),
+        ("std_x", np.float64),
+        ("std_profile", np.float64),
+        ("q_vy", np.float64),
+        ("entry_vy_std", np.float64),
+        ("absolute", np.int8),
+    ],
+    align=True,
+)
+"""Parameters of the mode, one record; lengths in m, speeds in m/s, times in s."""
+
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def profile_speed(
@@ -64,7 +86,7 @@ def enter_(
     Args:
         p: (N, 7) particles; rows first .. first + count - 1 are written.
         x: (>= 4,) mean.  L: (4, 4) lower Cholesky factor.
-        par: record of `particle_dtype`.
+        par: record of `PARTICLE_DTYPE`.
         rng: numpy Generator.
     """
     for a in range(first, first + count):
@@ -85,9 +107,10 @@ def enter_(
             peak = par.peak_low + (par.peak_high - par.peak_low) * rng.random()
             ratio = par.length_low + (par.length_high - par.length_low) * rng.random()
             length = peak * ratio
-            # The mode is feasible from f_min on: enter somewhere on the rising flank from there.
+            # The mode is feasible from f_min on: enter between there and the end of the plateau, so
+            # that a speed step is an entry as well as a ramp.
             begin = par.up * par.f_min / peak
-            u = begin + (par.up - begin) * rng.random()
+            u = begin + (par.down - begin) * rng.random()
             p[a, PEAK] = peak
             p[a, LENGTH] = length
             p[a, ENTRY] = p[a, PX] - u * length
@@ -186,26 +209,3 @@ def resample_(
             total += w[a]
         for c in range(p.shape[1]):
             out[k, c] = p[a, c]
-
-
-def particle_dtype() -> np.dtype[np.void]:
-    """Parameters of the mode, one record; lengths in m, speeds in m/s, times in s."""
-    return np.dtype(
-        [
-            ("absolute", np.bool_),
-            ("entry", np.float64),
-            ("up", np.float64),
-            ("down", np.float64),
-            ("peak_low", np.float64),
-            ("peak_high", np.float64),
-            ("length_low", np.float64),
-            ("length_high", np.float64),
-            ("f_min", np.float64),
-            ("y_low", np.float64),
-            ("y_high", np.float64),
-            ("std_x", np.float64),
-            ("std_profile", np.float64),
-            ("q_vy", np.float64),
-            ("entry_vy_std", np.float64),
-        ]
-    )

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from can_imm.estimation.imm import FIXED, LANE, MAX_ROWS, bank_dtype
+from can_imm.estimation.imm import BANK_DTYPE, FIXED, LANE, MAX_MODES, MAX_ROWS, MAX_STEPS
 from can_imm.estimation.models import (
     discretise,
     generator_from_dwell,
@@ -59,14 +59,11 @@ def builtin_presets() -> list[str]:
     return sorted(path.stem for path in PRESETS.glob("*.toml"))
 
 
-def load_bank(
-    name_or_path: str, *, step_ns: int = 10_000_000, horizon_s: float = 2.0
-) -> ModeBank:
+def load_bank(name_or_path: str, *, step_ns: int = 10_000_000) -> ModeBank:
     """Load a preset by name, or any TOML file by path.
 
     Args:
         step_ns: step of the loop [ns].
-        horizon_s: longest time between two measurements of one object [s].
 
     Raises:
         CanImmError: the file is missing, is not TOML or does not describe a mode bank.
@@ -85,7 +82,7 @@ def load_bank(
         raise CanImmError(f"{path}: {e.strerror or e}") from e
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
         raise CanImmError(f"{path}: {e}") from e
-    return bank_from_dict(data, str(path), step_ns=step_ns, horizon_s=horizon_s)
+    return bank_from_dict(data, str(path), step_ns=step_ns)
 
 
 class _Table:
@@ -119,6 +116,14 @@ class _Table:
         if math.isnan(value) or value < low or (open_low and value <= low):
             raise self.error(f"'{key}' = {value} is out of range")
         return value
+
+    def numbers(self, key: str, count: int) -> FloatArray:
+        values = self.take(key, list)
+        if len(values) != count or any(
+            isinstance(v, bool) or not isinstance(v, (int, float)) or not v > 0 for v in values
+        ):
+            raise self.error(f"'{key}' must be {count} positive numbers")
+        return np.array(values, float)
 
     def done(self) -> None:
         if self.data:
@@ -191,8 +196,25 @@ def _state(row: _Table, states: list[str]) -> int:
     return states.index(name)
 
 
+def _lane(
+    row: _Table, state: str, lanes: dict[str, tuple[int, int]]
+) -> tuple[int, tuple[int, int]]:
+    """Whether the row counts from a lane centre, and of which lanes."""
+    if "lane" not in row.data:
+        return FIXED, (0, 0)
+    lane = row.take("lane", str)
+    if state != "y" or lane not in lanes:
+        raise row.error(f"no lane '{lane}' for state '{state}' ({', '.join(lanes)})")
+    return LANE, lanes[lane]
+
+
 def _fill_constraints(
-    record: Any, j: int, mode: _Table, states: list[str], lanes: dict[str, tuple[int, int]]
+    record: Any,
+    j: int,
+    mode: _Table,
+    names: list[str],
+    states: list[str],
+    lanes: dict[str, tuple[int, int]],
 ) -> None:
     """Soft rows, bounds and entry distribution of mode j."""
     rows = _rows(mode, "soft")
@@ -201,20 +223,17 @@ def _fill_constraints(
         s = _state(row, states)
         record["soft_state"][j, c] = s
         record["soft_r"][j, c] = row.number("r", low=0.0)
-        if "lane" in row.data:
-            lane = row.take("lane", str)
-            if states[s] != "y" or lane not in lanes:
-                raise row.error(f"no lane '{lane}' for state '{states[s]}' ({', '.join(lanes)})")
-            record["soft_kind"][j, c] = LANE
-            record["soft_value"][j, c], record["soft_upper"][j, c] = lanes[lane]
-        else:
-            record["soft_kind"][j, c] = FIXED
-            record["soft_value"][j, c] = row.number("value")
+        record["soft_kind"][j, c], record["soft_lanes"][j, c] = _lane(row, states[s], lanes)
+        record["soft_value"][j, c] = row.number(
+            "value", 0.0 if record["soft_kind"][j, c] == LANE else None
+        )
         row.done()
     rows = _rows(mode, "bounds")
     record["n_bounds"][j] = len(rows)
     for c, row in enumerate(rows):
-        record["bound_state"][j, c] = _state(row, states)
+        s = _state(row, states)
+        record["bound_state"][j, c] = s
+        record["bound_kind"][j, c], record["bound_lanes"][j, c] = _lane(row, states[s], lanes)
         low = row.number("min", -math.inf)
         high = row.number("max", math.inf)
         if not low < high:
@@ -224,12 +243,17 @@ def _fill_constraints(
         record["bound_mass"][j, c] = row.take("mass", bool, False)
         row.done()
     rows = _rows(mode, "entry")
-    record["n_entry"][j] = len(rows)
-    for c, row in enumerate(rows):
-        record["entry_state"][j, c] = _state(row, states)
-        record["entry_mean"][j, c] = row.number("mean")
-        record["entry_var"][j, c] = row.number("std", low=0.0) ** 2
+    record["entry_var"][j] = -1.0
+    for row in rows:
+        s = _state(row, states)
+        record["entry_mean"][j, s] = row.number("mean")
+        record["entry_var"][j, s] = row.number("std", low=0.0) ** 2
         row.done()
+    sources = mode.take("entry_from", list, names)
+    for source in sources:
+        if source not in names:
+            raise mode.error(f"'entry_from' names the unknown mode '{source}'")
+        record["entry_sources"][names.index(source), j] = source != names[j]
 
 
 def _fill_particle(record: Any, table: _Table) -> int:
@@ -316,16 +340,21 @@ def _transitions(
 
 
 def bank_from_dict(
-    data: dict[str, Any], where: str, *, step_ns: int = 10_000_000, horizon_s: float = 2.0
+    data: dict[str, Any], where: str, *, step_ns: int = 10_000_000, n_steps: int = MAX_STEPS
 ) -> ModeBank:
-    """Check a preset's data and build its bank; ``where`` begins every error message.
+    """Check a preset's data and build its bank.
+
+    Args:
+        data: what the TOML file holds.
+        where: begins every error message.
+        step_ns: step of the loop [ns].
+        n_steps: how many rows of the tables are filled, at most `MAX_STEPS`.
 
     Raises:
         CanImmError: with the reason, in one line.
     """
     top = _Table(data, where)
     step_s = step_ns * 1e-9
-    n_steps = math.ceil(horizon_s / step_s) + 1
     name = top.take("name", str)
     top.take("description", str, "")
     states = top.take("states", list)
@@ -343,26 +372,25 @@ def bank_from_dict(
     if not modes:
         raise top.error("there is no [[mode]]")
     names = [m.get("name", f"#{i + 1}") if isinstance(m, dict) else f"#{i + 1}" for i, m in enumerate(modes)]
-    tables = [_Table(m, f"{where}, mode '{n}'") for n, m in zip(names, modes, strict=True)]
+    mode_tables = [_Table(m, f"{where}, mode '{n}'") for n, m in zip(names, modes, strict=True)]
     if len(set(names)) != len(names):
         raise top.error("two modes have the same name")
 
     m, n = len(names), len(states)
-    array = np.zeros((1,), bank_dtype(m, n, n_steps))
+    if m > MAX_MODES:
+        raise top.error(f"{m} modes, at most {MAX_MODES} are possible")
+    array = np.zeros((1,), BANK_DTYPE)
     record = array[0]
+    record["n_modes"], record["n_states"] = m, n
     record["step_s"] = step_s
     record["lane_width"] = width
     record["mu_floor"] = top.number("probability_floor", 1e-6, low=0.0)
     record["var_floor"] = top.number("variance_floor", 1e-8, low=0.0, open_low=True)
-    birth = top.take("birth_std", list)
-    if len(birth) != n or any(not isinstance(v, (int, float)) or v <= 0 for v in birth):
-        raise top.error(f"'birth_std' must be {n} positive numbers, one per state")
-    record["birth_std"] = birth
+    record["birth_std"][:n] = top.numbers("birth_std", n)
+    record["jump_std"] = top.numbers("jump_std", 4)
     variance = None
     if "measurement_variance" in top.data:
-        variance = np.array(top.take("measurement_variance", list), float)
-        if variance.shape != (4,) or not np.all(variance > 0):
-            raise top.error("'measurement_variance' must be 4 positive numbers")
+        variance = top.numbers("measurement_variance", 4)
     n_particles = 0
     if "particles" in top.data:
         n_particles = _fill_particle(record, _Table(top.take("particles", dict), f"{where}, particles"))
@@ -373,7 +401,7 @@ def bank_from_dict(
     direction = np.zeros(m, np.int8)
     dwell: list[float] = []
     following: list[dict[str, Any]] = []
-    for j, mode in enumerate(tables):
+    for j, mode in enumerate(mode_tables):
         mode.take("name", str)
         label = mode.take("manoeuvre", str)
         if label not in Manoeuvre.__members__ or label == "UNKNOWN":
@@ -387,27 +415,26 @@ def bank_from_dict(
         record["is_particle"][j] = mode.take("particles", bool, False)
         record["is_projected"][j] = mode.take("project", bool, False)
         if not record["is_particle"][j]:
-            record["F"][1, j], record["Q"][1, j] = _motion(mode, states, step_s)
+            F, Q = _motion(mode, states, step_s)
         elif not n_particles:
             raise mode.error("'particles' needs a [particles] table")
         else:
-            record["F"][1, j], record["Q"][1, j] = np.eye(n), np.zeros((n, n))
-            record["F"][1, j, 0, 1] = record["F"][1, j, 2, 3] = step_s
-        _fill_constraints(record, j, mode, states, lanes)
+            F, Q = np.eye(n), np.zeros((n, n))
+            F[0, 1] = F[2, 3] = step_s
+        tables = repeat(F, Q, n_steps)
+        record["F"][:n_steps, j, :n, :n], record["Q"][:n_steps, j, :n, :n] = tables
+        _fill_constraints(record, j, mode, names, states, lanes)
         if not from_matrix:
             dwell.append(mode.number("dwell_s", low=0.0, open_low=True))
             following.append(mode.take("next", dict))
         mode.done()
-    for j in range(m):
-        record["F"][:, j], record["Q"][:, j] = repeat(
-            record["F"][1, j].copy(), record["Q"][1, j].copy(), n_steps
-        )
     if record["is_particle"].sum() > 1:
         raise top.error("only one mode can have particles")
-    record["manoeuvre"] = [int(v) for v in manoeuvres]
-    record["entry_sources"] = ~np.eye(m, dtype=bool)
-    record["Pi"] = _transitions(transition, names, dwell, following, step_s, n_steps)
-    record["mu0"] = stationary(record["Pi"][min(100, n_steps - 1)])
+    record["manoeuvre"][:m] = manoeuvres
+    record["direction"][:m] = direction
+    Pi = _transitions(transition, names, dwell, following, step_s, n_steps)
+    record["Pi"][:n_steps, :m, :m] = Pi
+    record["mu0"][:m] = stationary(Pi[min(10, n_steps - 1)])
     top.done()
     return ModeBank(
         name, tuple(names), tuple(manoeuvres), direction, array, n, n_particles, step_ns, width, variance

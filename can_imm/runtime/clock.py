@@ -58,16 +58,18 @@ class WallClock:
 
 
 class PacedClock:
-    """Real time from a chosen origin on: the clock for watching a log at the speed of life."""
+    """Real time, from the first moment that is asked for: to watch a log at the speed of life."""
 
-    def __init__(self, origin_ns: int) -> None:
+    def __init__(self) -> None:
         self.jumps = 0
-        self._shift_ns = origin_ns - steady_ns()
+        self._shift_ns: int | None = None
 
     def now_ns(self) -> int:
-        return steady_ns() + self._shift_ns
+        return steady_ns() + (self._shift_ns or 0)
 
     def remaining_s(self, t_ns: int) -> float:
+        if self._shift_ns is None:
+            self._shift_ns = t_ns - steady_ns()
         return (t_ns - self.now_ns()) * 1e-9
 
 

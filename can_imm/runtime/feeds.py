@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Protocol
 
 from can_imm.bus.frame import Frame
@@ -102,7 +102,7 @@ class BusFeed:
         return self._pending[0].t_ns if self._pending else self.clock.now_ns()
 
     def _on_bus_time(self, frame: Frame) -> Frame:
-        now_ns = self.clock.now_ns()
+        now_ns = self.clock.now_ns() // 1000 * 1000
         t_ns = frame.t_ns + self._offset_ns
         if not self._done_ns - JUMP_NS <= t_ns <= now_ns + JUMP_NS:
             if self._foreign:

@@ -75,6 +75,18 @@ class Loop:
             return False
         self._t_ns = t_ns
         answers = self._node.step(t_ns, frames)
+        self._send(frames, answers)
+        self._account(t_ns, len(frames), len(answers))
+        return True
+
+    def send_last(self, frames_at: Callable[[int], list[Frame]]) -> None:
+        """Send a node's last words, ``frames_at(t_ns)`` at the time of the last step."""
+        if self._t_ns is not None:
+            answers = frames_at(self._t_ns)
+            self._send([], answers)
+            self._health.sent += len(answers)
+
+    def _send(self, frames: list[Frame], answers: list[Frame]) -> None:
         for sink in self._outputs:
             for frame in answers:
                 sink.send(frame)
@@ -83,8 +95,6 @@ class Loop:
                 sink.send(frame)
             for frame in answers:
                 sink.send(frame)
-        self._account(t_ns, len(frames), len(answers))
-        return True
 
     def _account(self, t_ns: int, received: int, sent: int) -> None:
         health = self._health

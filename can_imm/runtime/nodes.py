@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
-from can_imm.bus.encoder import StatusValues
+from can_imm.bus.encoder import DetectorState, ManoeuvreEncoder, StatusValues
 from can_imm.bus.frame import Frame
 from can_imm.runtime.health import Health
 from can_imm.types import Scan
 
-STATUS_PERIOD_NS = 100_000_000
-"""Cycle time of DetectorStatus [ns], as the DBC states it."""
+if TYPE_CHECKING:
+    from can_imm.bus.decoder import ScanDecoder
+    from can_imm.bus.encoder import RadarEncoder
+    from can_imm.detector import Detector
+    from can_imm.sim.player import Player
 
 SENSOR_TIMEOUT_NS = 1_000_000_000
 """After so long without a scan [ns] the heartbeat says that there is no sensor."""
@@ -30,18 +33,10 @@ Listener = Callable[[int, Reports], None]
 detector's own buffer and holds good until the next step."""
 
 
-class ScanEncoder(Protocol):
-    def encode(self, scan: Scan, t_ns: int) -> list[Frame]: ...
-
-
-class ScanPlayer(Protocol):
-    def step(self, t_ns: int) -> Scan | None: ...
-
-
 class SenderNode:
     """Sends the scans of a player as frames, when they are due."""
 
-    def __init__(self, player: ScanPlayer, encoder: ScanEncoder) -> None:
+    def __init__(self, player: Player, encoder: RadarEncoder) -> None:
         self._player = player
         self._encoder = encoder
 
@@ -59,6 +54,10 @@ class DetectorNode:
         encoder: writes the answers; one per node, for its alive counters.
         health: the loop's counters, published in DetectorStatus.
         listeners: called with the reports after each scan.
+        capacity: objects that a scan of the decoder can hold.
+
+    Attributes:
+        dropped_scans: scans that the detector never saw, because too many came at once.
     """
 
     def __init__(
@@ -68,22 +67,28 @@ class DetectorNode:
         encoder: ManoeuvreEncoder,
         health: Health,
         listeners: Sequence[Listener] = (),
+        capacity: int = 64,
     ) -> None:
         self.decoder = decoder
         self.detector = detector
         self._encoder = encoder
         self._health = health
         self._listeners = listeners
-        # The decoder reuses its scan, and the detector takes one per step: the rest waits in copies.
-        self._free = [Scan(decoder.capacity) for _ in range(MAX_WAITING)]
+        # The decoder reuses its scan and the detector takes one per step: the rest waits in copies.
+        self._free = [Scan(capacity) for _ in range(MAX_WAITING)]
         self._waiting: deque[Scan] = deque()
-        self._dropped_scans = 0
+        self.dropped_scans = 0
+        # answers go where the sensor's frames came from
+        self._channel: str | None = None
         self._seen_ns: int | None = None
         self._status_ns: int | None = None
 
     def step(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
         for frame in frames:
-            self._queue(self.decoder.feed(frame))
+            scan = self.decoder.feed(frame)
+            if scan is not None:
+                self._channel = frame.channel
+                self._queue(scan)
         self._queue(self.decoder.flush(t_ns))
         scan = self._waiting.popleft() if self._waiting else None
         n = self.detector.step(t_ns, scan)
@@ -95,21 +100,23 @@ class DetectorNode:
             answers += self._encoder.encode(reports, t_ns)
             for listener in self._listeners:
                 listener(t_ns, reports)
-        if self._status_ns is None or t_ns >= self._status_ns + STATUS_PERIOD_NS:
+        if self._status_ns is None or t_ns >= self._status_ns + self._encoder.status_period_ns:
             self._status_ns = t_ns
             answers.append(self._encoder.status(t_ns, self._status(t_ns)))
+        if self._channel is not None:
+            answers = [frame._replace(channel=self._channel) for frame in answers]
         return answers
 
-    @property
-    def dropped_scans(self) -> int:
-        """Scans that never reached the estimators: lost on the way, or too many at once."""
-        return self._dropped_scans
+    def farewell(self, t_ns: int) -> list[Frame]:
+        """Return the last frame of a detector that ends: DetectorStatus, state Stopping."""
+        values = self._status(t_ns)._replace(state=DetectorState.STOPPING)
+        return [self._encoder.status(t_ns, values)._replace(channel=self._channel)]
 
     def _queue(self, scan: Scan | None) -> None:
         if scan is None:
             return
         if not self._free:
-            self._dropped_scans += 1
+            self.dropped_scans += 1
             return
         copy = self._free.pop()
         copy.copy_from(scan)
@@ -117,15 +124,15 @@ class DetectorNode:
 
     def _status(self, t_ns: int) -> StatusValues:
         if self._seen_ns is None:
-            state = State.STARTING
+            state = DetectorState.STARTING
         elif t_ns - self._seen_ns > SENSOR_TIMEOUT_NS:
-            state = State.NO_SENSOR
+            state = DetectorState.NO_SENSOR
         else:
-            state = State.RUNNING
+            state = DetectorState.RUNNING
         return StatusValues(
             state=state,
             objects_tracked=self.detector.n_tracked,
             deadline_misses=self._health.deadline_misses,
             frames_rejected=self.decoder.counts.rejected,
-            dropped_scans=self.dropped_scans,
+            dropped_scans=self.dropped_scans + self.decoder.counts.incomplete_scans,
         )

@@ -14,12 +14,14 @@ _RECEDING, _APPROACHING, _OVERTAKING = 10.0 / _KMH, 15.0 / _KMH, 7.6 / _KMH
 """Peaks of the published scenario [m/s]."""
 _CHANGE_TIMES = (2.0, 4.0)
 """Times of the published lane changes, for a lane of 3 m [s]."""
+_NEAR, _FAR = 20.0, 75.0
+"""Gaps [m] below which nothing but receding begins, and above which no receding does."""
 _TICK = 0.01
 """All times are multiples of it [s]."""
 
 
 def random_scenario(rng: np.random.Generator) -> Scenario:
-    """Draw a drive of roughly 60 to 80 s with one object on a road with two lanes.
+    """Draw a drive of roughly 60 to 85 s (rarely longer) with one object on a road with two lanes.
 
     What is random, and how (U is the uniform distribution):
 
@@ -80,7 +82,8 @@ class _Driver:
             self.keep(self.between(2.0, 8.0))
             if closes_gap:
                 last_approach = self.time_for(self.gap, last_peak)
-            if self.time + last_approach >= end:
+            too_near = closes_gap and self.gap < _NEAR
+            if self.time + last_approach >= end and not too_near:
                 break
             # receding costs time twice where the gap must be closed again
             self.manoeuvre(may_recede=self.time + last_approach + 22.0 < end)
@@ -99,12 +102,12 @@ class _Driver:
 
     def manoeuvre(self, *, may_recede: bool) -> None:
         """Append one of the manoeuvres that the lane and the gap allow."""
-        if self.gap < 20.0:
+        if self.gap < _NEAR:
             self.recede()
             return
         change, overtake, recede = (0.25, 0.3, 0.25) if self.lane == RIGHT else (0.6, 0.0, 0.2)
         weights = np.array(
-            [change, overtake, recede if may_recede and self.gap <= 75.0 else 0.0, 0.2]
+            [change, overtake, recede if may_recede and self.gap <= _FAR else 0.0, 0.2]
         )
         choice = self.rng.choice(4, p=weights / weights.sum())
         (self.change_lane, self.overtake, self.recede, self.approach)[choice]()

@@ -34,7 +34,7 @@ _T = TypeVar("_T")
 _KMH = 3.6
 _LANES = {"right": RIGHT, "left": LEFT}
 _DIRECTIONS = {"left": +1, "right": -1}
-_LABELS = {m.name: m for m in Manoeuvre if m is not Manoeuvre.UNKNOWN}
+_LABELS = {m.name: m for m in Manoeuvre if m not in (Manoeuvre.UNKNOWN, Manoeuvre.REAR_END)}
 _FOLDER = files("can_imm.sim") / "scenarios"
 
 
@@ -107,10 +107,10 @@ class _Table:
             raise self._refuse(key, "a whole number", value)
         return value
 
-    def choice(self, key: str, choices: dict[str, _T]) -> _T:
+    def choice(self, key: str, choices: dict[str, _T], hint: str = "") -> _T:
         value = self._take(key, None)
         if not isinstance(value, str) or value not in choices:
-            raise self._refuse(key, "one of " + ", ".join(choices), value)
+            raise self._refuse(key, f"one of {', '.join(choices)}{hint}", value)
         return choices[value]
 
     def table(self, key: str) -> _Table:
@@ -160,7 +160,7 @@ def _object(table: _Table) -> ScenarioObject:
 
 
 def _segment(row: _Table) -> Segment:
-    label = row.choice("label", _LABELS)
+    label = row.choice("label", _LABELS, " (an approach becomes REAR_END by its gap)")
     overtaking = label is Manoeuvre.OVERTAKING
     segment = Segment(
         start=row.number("start"),

@@ -3,7 +3,9 @@
 Each object is a kinematic bicycle whose reference point, the middle of the rear axle, is the point
 that the sensor sees.  A Stanley controller steers its front axle along a piecewise-linear path.
 The path's knots lie where a vehicle that follows it exactly is at the times of the scenario table,
-so each lane change takes the time that the table gives it.  The vehicle's speed along its own
+so each lane change takes the time that the table gives it (to a few ms: the rear axle cuts the
+corners).  Stanley's law keeps the front axle of a kinematic bicycle on the path, so that the gain
+matters only off it; what the sensor sees trails by a wheelbase.  The vehicle's speed along its own
 heading is the ego's plus the profile of the table: a trapezoid inside each window.
 """
 

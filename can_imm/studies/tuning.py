@@ -35,9 +35,13 @@ WEIGHTS = {"A": 1 / 6, "B": 1 / 6, "S": 1 / 6, "random": 1 / 2}
 
 _STEPS = (0.3, 0.15, 0.07, 0.03)
 """Relative steps of the search, coarse to fine."""
-_CHOICES = {"hysteresis": (0.0, 0.1, 0.2, 0.3, 0.4, 0.5), "dwell": (1, 2, 3, 4)}
+_CHOICES = {
+    "out_of_right_lane": (False, True),
+    "hysteresis": (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5),
+    "dwell": (1, 2, 3, 4),
+}
 """Values tried for what is not a threshold."""
-_STARTS = 12
+_STARTS = 20
 """Starting points of the search: the constants as they stand, and random ones around them."""
 _SPREAD = 0.35
 """Standard deviation of the random starting points' logarithms."""
@@ -110,7 +114,7 @@ def _wrong_frames(x: FloatArray, label: Int8Array, length: Int64Array, rules: Ru
     return total / len(x)
 
 
-class _Objective:
+class Objective:
     """Share of wrong frames of a set of rules; remembers the filtered states by noise."""
 
     def __init__(self, data: dict[str, Data]) -> None:
@@ -136,7 +140,7 @@ def _neighbours(rules: Rules, name: str, step: float) -> Iterator[Rules]:
             yield rules._replace(**{name: value})
 
 
-def _descend(objective: Callable[[Rules], float], rules: Rules) -> tuple[float, Rules]:
+def descend(objective: Callable[[Rules], float], rules: Rules) -> tuple[float, Rules]:
     """One threshold at a time, until no step of any size helps."""
     best = objective(rules)
     for step in _STEPS:
@@ -155,15 +159,17 @@ def tune_rules(
     data: dict[str, Data], rng: np.random.Generator, progress: Callable[[float], None]
 ) -> Rules:
     """Minimise the share of wrong frames; ``progress`` is called with the best so far."""
-    objective = _Objective(data)
+    objective = Objective(data)
     best, rules = np.inf, RULES
     for start in range(_STARTS):
         scale = np.exp(_SPREAD * rng.standard_normal(len(Rules._fields))) if start else None
-        error, found = _descend(objective, RULES if scale is None else _scaled(RULES, scale))
+        error, found = descend(objective, RULES if scale is None else _scaled(RULES, scale))
         if error < best:
             best, rules = error, found
         progress(best)
-    return rules._replace(**{name: round(value, 3) for name, value in rules._asdict().items()})
+    return rules._replace(
+        **{n: round(v, 3) for n, v in rules._asdict().items() if n not in _CHOICES}
+    )
 
 
 def _scaled(rules: Rules, scale: FloatArray) -> Rules:
@@ -177,7 +183,7 @@ def _scaled(rules: Rules, scale: FloatArray) -> Rules:
 
 def wrong_frames(data: dict[str, Data], rules: Rules) -> dict[str, float]:
     """Share of wrong frames of these rules, by truth."""
-    return _Objective(data).per_truth(rules)
+    return Objective(data).per_truth(rules)
 
 
 def relative_rmse(data: dict[str, Data], noise: Noise) -> FloatArray:

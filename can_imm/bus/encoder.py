@@ -1,0 +1,168 @@
+"""Scans and reports to the frames of can_imm.dbc."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from can_imm.bus.codec import Field, field, load_dbc
+from can_imm.bus.frame import Frame
+from can_imm.bus.profile import dbc_dir
+from can_imm.bus.protection import P01_COUNTERS, p01_data_id, p01_protect
+from can_imm.types import VX, VY, Scan, X, Y
+
+DBC = dbc_dir() / "can_imm.dbc"
+
+STATUS_ID = 0x31F
+OUTPUT_IDS = frozenset({0x310, 0x311, STATUS_ID})
+"""ManoeuvreState, ObjectEstimate, DetectorStatus."""
+
+
+class DetectorState(IntEnum):
+    """Signal State of DetectorStatus."""
+
+    STARTING = 0
+    RUNNING = 1
+    NO_SENSOR = 2
+    STOPPING = 3
+
+
+class StatusValues(NamedTuple):
+    """Content of DetectorStatus; the counts are those since the start and saturate at 4095."""
+
+    state: int
+    objects_tracked: int
+    deadline_misses: int
+    frames_rejected: int
+    dropped_scans: int
+
+
+@cache
+def own_dbc() -> Any:
+    """The cantools database of can_imm.dbc."""
+    return load_dbc(DBC)
+
+
+class MessageEncoder:
+    """Packs one message of can_imm.dbc and protects it.
+
+    ``encode`` takes the physical values in the order of ``signals``; a value that is NaN or out of
+    range is sent as "not available" where the signal has such a code, otherwise as the end of the
+    range.
+    """
+
+    def __init__(self, name: str, signals: tuple[str, ...]) -> None:
+        message = own_dbc().get_message_by_name(name)
+        self.id: int = message.frame_id
+        self.cycle_ns: int = message.cycle_time * 1_000_000
+        self._length: int = message.length
+        self._data_id = p01_data_id(message, DBC)
+        self._counter = 0
+        self._parts: list[tuple[int, Field]] = []
+        for signal in map(message.get_signal_by_name, signals):
+            assert signal.byte_order == "little_endian"
+            self._parts.append((signal.start, field(signal)))
+
+    def encode(self, t_ns: int, *values: float) -> Frame:
+        """The next frame of this id."""
+        word = 0
+        for (shift, scaling), value in zip(self._parts, values, strict=True):
+            word |= scaling.raw(value) << shift
+        data = bytearray(word.to_bytes(self._length, "little"))
+        p01_protect(data, self._data_id, self._counter)
+        self._counter = (self._counter + 1) % P01_COUNTERS
+        return Frame(t_ns, self.id, bytes(data))
+
+
+class RadarEncoder:
+    """A radar-like sensor's frames: RadarScan, then a RadarObject per object.
+
+    An object whose id does not fit the message (0 to 63) is left out and counted in ``left_out``.
+    """
+
+    def __init__(self) -> None:
+        self._scan = MessageEncoder("RadarScan", ("ObjectCount", "ScanCounter"))
+        self._object = MessageEncoder(
+            "RadarObject",
+            ("ObjectId", "ObjectValid", "ObjectNew", "DistLong", "VrelLong", "DistLat", "VrelLat"),
+        )
+        self._scans = 0
+        self.left_out = 0
+
+    def encode(self, scan: Scan, t_ns: int) -> list[Frame]:
+        """Frames of ``scan``, stamped ``t_ns`` [ns]; components that are not valid are sent as not
+        available."""
+        rows = [i for i in range(scan.n) if 0 <= scan.ids[i] <= 63]
+        self.left_out += scan.n - len(rows)
+        frames = [self._scan.encode(t_ns, len(rows), self._scans)]
+        self._scans = (self._scans + 1) % 65536
+        for i in rows:
+            z = [scan.z[i, k] if scan.valid[i, k] else np.nan for k in (X, VX, Y, VY)]
+            frames.append(self._object.encode(t_ns, scan.ids[i], 1, scan.new[i], *z))
+        return frames
+
+
+class ManoeuvreEncoder:
+    """The detector's frames.
+
+    A report whose object id does not fit the messages (0 to 126) is left out and counted in
+    ``left_out``.
+
+    Attributes:
+        status_period_ns: cycle time of DetectorStatus [ns].
+    """
+
+    def __init__(self) -> None:
+        self._state = MessageEncoder(
+            "ManoeuvreState",
+            ("ObjectId", "Coasting", "Manoeuvre", "SecondManoeuvre", "Direction", "Lane",
+             "Probability", "SecondProbability", "TrackAge"),
+        )  # fmt: skip
+        self._estimate = MessageEncoder(
+            "ObjectEstimate", ("ObjectId", "DistLong", "VrelLong", "DistLat", "VrelLat")
+        )
+        self._status = MessageEncoder(
+            "DetectorStatus",
+            ("State", "ObjectsTracked", "DeadlineMisses", "FramesRejected", "DroppedScans"),
+        )
+        self.status_period_ns = self._status.cycle_ns
+        self.left_out = 0
+
+    def encode(self, reports: npt.NDArray[np.void], t_ns: int) -> list[Frame]:
+        """ManoeuvreState and ObjectEstimate for each of the reports (REPORT_DTYPE)."""
+        frames = []
+        for report in reports:
+            object_id = int(report["object_id"])
+            if not 0 <= object_id <= 126:
+                self.left_out += 1
+                continue
+            x, vx, y, vy = report["x"].tolist()
+            lane = int(report["lane"])
+            frames.append(
+                self._state.encode(
+                    t_ns,
+                    object_id,
+                    int(report["coasting"]),
+                    int(report["manoeuvre"]),
+                    int(report["second"]),
+                    DIRECTIONS.index(int(report["direction"])),
+                    lane if lane >= 0 else np.nan,
+                    100.0 * float(report["probability"]),
+                    100.0 * float(report["second_probability"]),
+                    int(report["age"]),
+                )
+            )
+            frames.append(self._estimate.encode(t_ns, object_id, x, vx, y, vy))
+        return frames
+
+    def status(self, t_ns: int, values: StatusValues) -> Frame:
+        """DetectorStatus."""
+        return self._status.encode(t_ns, *values)
+
+
+DIRECTIONS = (0, 1, -1)
+"""Direction of a lane change (+1 left, -1 right) by the value on the bus."""

@@ -1,0 +1,194 @@
+"""Where frames come from: log files and buses."""
+
+from __future__ import annotations
+
+import errno
+import gzip
+import io
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import can
+
+from can_imm.bus import candump
+from can_imm.bus.errors import one_line
+from can_imm.bus.frame import Frame, from_message
+from can_imm.types import CanImmError
+
+LOG_SUFFIXES = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
+"""Log formats; the text ones (.asc .csv .log .trc) also with .gz."""
+
+_GZ_SUFFIXES = (".asc", ".csv", ".log", ".trc")
+
+_GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.EBADF, errno.ENOTSOCK})
+_FAILURES_TO_GONE = 100
+
+
+def log_suffix(path: Path) -> tuple[str, bool]:
+    """Format suffix of a log's name, and whether it is compressed.
+
+    Raises:
+        CanImmError: not a format that we know.
+    """
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    packed = suffixes[-1:] == [".gz"]
+    suffix = "".join(suffixes[-2:-1] if packed else suffixes[-1:])
+    if suffix not in (_GZ_SUFFIXES if packed else LOG_SUFFIXES):
+        raise CanImmError(
+            f"{path}: unknown log format (known: {' '.join(LOG_SUFFIXES)}; "
+            f"compressed: {' '.join(s + '.gz' for s in _GZ_SUFFIXES)})"
+        )
+    return suffix, packed
+
+
+class LogSource:
+    """The frames of a log file, in the order of the file; iterate over it once.
+
+    A line that is no frame is counted and skipped. When the file breaks off, what came before
+    stands and ``damage`` says what happened.
+
+    Attributes:
+        bad_lines: lines that are no frames (.log only).
+        dropped_frames: frames that the recorder says it lost (DROPCOUNT lines, .log only).
+        damage: one line on what is wrong with the file, None if nothing is.
+
+    Raises:
+        CanImmError: at construction, the file cannot be opened or has an unknown format; at the end
+            of the iteration, it does not hold a single frame.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self.bad_lines = self.dropped_frames = 0
+        self.damage: str | None = None
+        suffix, packed = log_suffix(self.path)
+        try:
+            self._size = self.path.stat().st_size
+            self._file: BinaryIO = self.path.open("rb")
+        except OSError as error:
+            raise CanImmError(f"{self.path}: {one_line(error)}") from error
+        self._text: Any = None
+        self._reader: Any = None
+        if suffix == ".log":
+            unpacked: Any = gzip.GzipFile(fileobj=self._file) if packed else self._file
+            # "replace" keeps garbage bytes from being more than a bad line
+            self._text = io.TextIOWrapper(unpacked, "ascii", "replace", newline="\n")
+            self._frames = self._candump()
+        else:
+            self._frames = self._messages()
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self._checked()
+
+    def __enter__(self) -> LogSource:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; the iteration does so at its end."""
+        for item in (self._text, self._file):
+            if item is not None:
+                item.close()
+        if self._reader is not None:
+            self._reader.stop()
+
+    def progress(self) -> float | None:
+        """How much of the file has been read, 0 to 1; None where the format does not tell."""
+        file: Any = self._file
+        if self._reader is not None:
+            file = getattr(self._reader, "file", None)
+            file = getattr(file, "buffer", file)
+            file = getattr(file, "fileobj", None) or file
+        if file is None or self._size == 0:
+            return None
+        try:
+            return min(1.0, float(file.tell() / self._size))
+        except (OSError, ValueError, AttributeError):
+            return 1.0 if getattr(file, "closed", False) else None
+
+    def _checked(self) -> Iterator[Frame]:
+        any_frame = False
+        try:
+            for frame in self._frames:
+                any_frame = True
+                yield frame
+        except Exception as error:  # whatever a reader of python-can may raise on a broken file
+            self.damage = f"{self.path}: broken, reading stopped: {one_line(error)}"
+        finally:
+            self.close()
+        if not any_frame:
+            bad = f"; {self.bad_lines} lines are not frames" if self.bad_lines else ""
+            raise CanImmError(self.damage or f"{self.path}: no CAN frames in this log{bad}")
+
+    def _candump(self) -> Iterator[Frame]:
+        parse = candump.parse
+        for line in self._text:
+            frame = parse(line)
+            if frame is not None:
+                yield frame
+            elif dropped := candump.dropped(line):
+                self.dropped_frames += dropped
+            elif line.strip():
+                self.bad_lines += 1
+
+    def _messages(self) -> Iterator[Frame]:
+        self._file.close()
+        if self._size:
+            self._reader = can.LogReader(self.path)
+            yield from map(from_message, self._reader)
+
+
+class BusGone(CanImmError):  # noqa: N818 - it says what happened
+    """The bus cannot be used any more."""
+
+
+class BusSource:
+    """Frames from an open bus.
+
+    Attributes:
+        errors: failed reads that were survived, such as those of a link that is down.
+    """
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+        self._failures = 0
+        self.errors = 0
+
+    def recv(self, timeout_s: float) -> Frame | None:
+        """The next frame, None if there is none within ``timeout_s`` seconds or the read failed.
+
+        Raises:
+            BusGone: the device is gone, or nothing but failures for long.
+        """
+        try:
+            message = self._bus.recv(timeout_s)
+        except (can.CanError, OSError, ValueError) as error:
+            self._survive(error, timeout_s)
+            return None
+        self._failures = 0
+        return None if message is None else from_message(message)
+
+    def _survive(self, error: Exception, timeout_s: float) -> None:
+        code = error_code(error)
+        self.errors += 1
+        self._failures += 1
+        # a link that is down may come up again, no matter how late
+        long = self._failures >= _FAILURES_TO_GONE and code != errno.ENETDOWN
+        if code in _GONE or long:
+            raise BusGone(f"bus {self._bus.channel_info}: {one_line(error)}") from error
+        # a failed read returns at once: do not spin
+        time.sleep(min(max(timeout_s, 0.0), 0.01))
+
+
+def error_code(error: BaseException) -> int | None:
+    """The errno behind an error of python-can, if it is known."""
+    for cause in (error, error.__cause__):
+        code = getattr(cause, "error_code", None) or getattr(cause, "errno", None)
+        if code is not None:
+            return int(code)
+    return None

@@ -1,0 +1,148 @@
+"""Play a scenario as radar frames onto a bus and/or into a log file.
+
+  can-imm simulate -i udp_multicast                    the published scenario, in real time
+  can-imm simulate -i socketcan -c vcan0 --scenario random --seed 7
+  can-imm simulate --log drive.log --truth drive.csv   as fast as possible, no bus
+  can-imm simulate --scenario mine.toml --log mine.blf
+
+A bus is used when a bus option is given, or when there is no file to write; it plays in real time.
+Bus settings that are not given come from python-can's configuration files.  The times in the
+truth file are those of the frames: seconds from 0 without a bus, Unix time on a bus.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from can_imm.cli.bus_options import add_bus_arguments, bus_wanted, open_bus_from
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from can_imm.sim.truth import Truth
+
+LEAD_NS = 500_000_000
+"""On a bus the scenario starts this long [ns] after the command is ready to send."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--scenario",
+        default="paper-a",
+        metavar="NAME|FILE|random",
+        help="paper-a (default), paper-b, paper-s, random, or a TOML file",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="of noise and random scenario (default: 0)"
+    )
+    parser.add_argument(
+        "--missed",
+        type=float,
+        default=0.0,
+        metavar="P",
+        help="probability that an object is missing from a scan (default: 0)",
+    )
+    parser.add_argument(
+        "--dropout",
+        type=float,
+        default=0.0,
+        metavar="P",
+        help="probability that a whole scan is missing (default: 0)",
+    )
+    parser.add_argument(
+        "--log", metavar="FILE", help="write the frames to a log; its ending chooses the format"
+    )
+    parser.add_argument("--truth", metavar="FILE.csv", help="write what truly happens, every 10 ms")
+    add_bus_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    import numpy as np
+
+    from can_imm.bus.encoder import RadarEncoder
+    from can_imm.bus.sinks import BusSink, LogSink
+    from can_imm.runtime.clock import Clock, FastClock, WallClock
+    from can_imm.runtime.feeds import IdleFeed
+    from can_imm.runtime.health import Health
+    from can_imm.runtime.loop import STEP_NS, Loop
+    from can_imm.runtime.loop import run as run_loops
+    from can_imm.runtime.nodes import SenderNode
+    from can_imm.sim.player import Player
+    from can_imm.sim.random import random_scenario
+    from can_imm.sim.scenario import load_scenario
+    from can_imm.sim.sensor import SensorModel, measure
+    from can_imm.sim.truth import simulate
+    from can_imm.types import CanImmError
+
+    if args.seed < 0:
+        raise CanImmError(f"--seed must be 0 or more, not {args.seed}")
+    rng = np.random.default_rng(args.seed)
+    scenario = random_scenario(rng) if args.scenario == "random" else load_scenario(args.scenario)
+    truths = simulate(scenario)
+    scans = measure(truths, SensorModel(missed=args.missed, dropout=args.dropout), rng)
+
+    with ExitStack() as stack:
+        outputs = []
+        clock: Clock = FastClock()
+        if bus_wanted(args) or not (args.log or args.truth):
+            bus = stack.enter_context(open_bus_from(args))
+            outputs.append(BusSink(bus))
+            clock = WallClock()
+            start_ns = -(-(clock.now_ns() + LEAD_NS) // STEP_NS) * STEP_NS
+            where = f"on {bus.channel_info}"
+        else:
+            start_ns = 0
+            where = f"into {args.log or args.truth}"
+        log = LogSink(args.log) if args.log else None
+        if log is not None:
+            stack.callback(log.close)
+        if args.truth:
+            write_truth(args.truth, truths, start_ns)
+        health = Health()
+        player = Player(scans, start_ns)
+        loop = Loop(
+            IdleFeed(clock),
+            SenderNode(player, RadarEncoder()),
+            health,
+            outputs,
+            [log] if log else [],
+        )
+        _say(f"playing {args.scenario} {where}: {len(truths)} objects, {len(scans)} scans")
+        run_loops([loop], stop=lambda: player.done)
+    if log is not None and log.damage:
+        raise CanImmError(log.damage)
+    _say(f"sent {health.sent:,} frames, {health.deadline_misses:,} deadlines missed")
+    return 0
+
+
+def write_truth(path: str, truths: Sequence[Truth], start_ns: int) -> None:
+    """Write one row per object and 10 ms; ``start_ns`` is the bus time of the scenario's time 0."""
+    from can_imm.cli.reports import DIRECTION, STATES, seconds
+    from can_imm.types import Manoeuvre
+
+    with Path(path).open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["time_s", "object_id", "manoeuvre", "lane", "direction", *STATES])
+        for truth in truths:
+            for t_ns, label, lane, direction, state in zip(
+                truth.t_ns, truth.label, truth.lane, truth.direction, truth.state, strict=True
+            ):
+                writer.writerow(
+                    [
+                        seconds(start_ns + int(t_ns)),
+                        truth.object_id,
+                        Manoeuvre(label).name,
+                        lane,
+                        DIRECTION[int(direction)],
+                        *(f"{value:.4f}" for value in state),
+                    ]
+                )
+
+
+def _say(text: str) -> None:
+    print(f"can-imm: {text}", file=sys.stderr, flush=True)
