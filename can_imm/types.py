@@ -88,6 +88,11 @@ class Scan:
 REPORT_DTYPE = np.dtype(
     [
         ("t_ns", np.int64),
+        ("probability", np.float64),
+        ("second_probability", np.float64),
+        ("x", np.float64, (4,)),
+        ("cov", np.float64, (4, 4)),
+        ("p", np.float64, (N_MANOEUVRES,)),
         ("object_id", np.int32),
         ("age", np.int32),
         ("manoeuvre", np.int8),
@@ -95,12 +100,8 @@ REPORT_DTYPE = np.dtype(
         ("direction", np.int8),
         ("lane", np.int8),
         ("coasting", np.bool_),
-        ("probability", np.float64),
-        ("second_probability", np.float64),
-        ("x", np.float64, (4,)),
-        ("cov", np.float64, (4, 4)),
-        ("p", np.float64, (N_MANOEUVRES,)),
-    ]
+    ],
+    align=True,
 )
 """What the detector says of one object after a scan.
 

@@ -13,9 +13,10 @@ from can_imm.bus.frame import BRS, DLC_SHIFT, ERROR, ESI, EXTENDED, FD, REMOTE, 
 _ERROR_BIT = 0x2000_0000
 _HEAD = r"\((\d{1,12})\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
 # the digit after "_" is a length code above 8, which says nothing about the data
-_CLASSIC = re.compile(_HEAD + r"([0-9A-Fa-f]{0,16})(?:_[9A-Fa-f])?(\s+[RrTt])?\s*").fullmatch
+_CLASSIC = re.compile(_HEAD + r"([0-9A-Fa-f]{0,16})(?:_[9A-Fa-f])?(\s+[RrTt])?\s*", re.A).fullmatch
 _OTHER = re.compile(
-    _HEAD + r"(?:#([0-9A-Fa-f])([0-9A-Fa-f]{0,128})|[Rr]([0-8]?)(?:_[9A-Fa-f])?)(\s+[RrTt])?\s*"
+    _HEAD + r"(?:#([0-9A-Fa-f])([0-9A-Fa-f]{0,128})|[Rr]([0-8]?)(?:_[9A-Fa-f])?)(\s+[RrTt])?\s*",
+    re.A,
 ).fullmatch
 _DROPPED = re.compile(r"DROPCOUNT: dropped (\d+) CAN frames").match
 

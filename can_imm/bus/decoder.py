@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-from can_imm.bus.codec import Field, compile_reader, field, find_signal
 from can_imm.bus.frame import ERROR, EXTENDED, FD, REMOTE, Frame
+from can_imm.bus.layout import HEADER, CompiledMessage, Layout
 from can_imm.bus.profile import Profile
-from can_imm.bus.protection import Guard, p01_data_id, p01_guard, toyota_guard
 from can_imm.types import Scan
 
 _UNSUITABLE = EXTENDED | FD | REMOTE | ERROR
@@ -25,11 +22,12 @@ class DecodeCounts:
     Every frame is counted in ``frames`` and in exactly one of ``unknown`` (an id that is not the
     sensor's), ``bad_kind`` (our id, but an extended, FD, remote or error frame), ``bad_length``,
     ``bad_crc`` (in profile 1 the invalid counter 15, too), ``bad_counter`` (a repeated frame),
-    ``out_of_range``, ``stray`` (an object without a scan to belong to), ``duplicates`` (an object twice in a scan),
-    ``overflow`` (more objects than there is room for), ``empty`` (right, but without an object) and
-    ``used``. Beside that: ``checksums_ok`` frames with a right checksum, ``lost`` frames missing by
-    their counters, ``not_available`` single values that the sensor did not have, ``scans``
-    finished, ``incomplete_scans`` of these with an announced object missing or rejected.
+    ``out_of_range``, ``stray`` (an object without a scan to belong to), ``duplicates`` (an object
+    twice in a scan), ``overflow`` (more objects than there is room for), ``empty`` (right, but
+    without an object) and ``used``. Beside that: ``checksums_ok`` frames with a right checksum,
+    ``lost`` frames missing by their counters, ``not_available`` single values that the sensor did
+    not have, ``scans`` finished, ``incomplete_scans`` of these with an announced object missing or
+    rejected, ``lost_scans`` missing by their counter.
     """
 
     frames: int = 0
@@ -49,6 +47,7 @@ class DecodeCounts:
     not_available: int = 0
     scans: int = 0
     incomplete_scans: int = 0
+    lost_scans: int = 0
 
     @property
     def rejected(self) -> int:
@@ -63,42 +62,6 @@ class DecodeCounts:
             + self.duplicates
             + self.overflow
         )
-
-
-class _Message:
-    """A message compiled: its checks, its reader and the last counter that was seen."""
-
-    __slots__ = ("guard", "last_counter", "last_ns", "length", "read", "slot")
-
-    def __init__(self, profile: Profile, message: Any, names: list[str], slot: int) -> None:
-        signals = [find_signal(message, name, profile.path, profile.dbc) for name in names]
-        self.length: int = message.length
-        self.read = compile_reader(message, signals)
-        self.slot = slot  # -1: the header
-        self.guard = _guard(profile, message)
-        self.last_counter = -1
-        self.last_ns = 0
-
-
-def _guard(profile: Profile, message: Any) -> Guard | None:
-    if profile.protection == "e2e-p01":
-        return p01_guard(p01_data_id(message, profile.dbc))
-    if profile.protection == "toyota":
-        assert profile.protection_counter is not None
-        signal = find_signal(message, profile.protection_counter, profile.path, profile.dbc)
-        read = compile_reader(message, [signal])
-        return toyota_guard(
-            message.frame_id, message.length, lambda data: read(data)[0], 1 << signal.length
-        )
-    return None
-
-
-def _condition(entry: Any, scaling: Field) -> Callable[[int], bool]:
-    """The test of a validity condition on the raw value."""
-    scale, offset, equals, below = scaling.scale, scaling.offset, entry.equals, entry.below
-    if equals is not None:
-        return lambda raw: raw * scale + offset == equals
-    return lambda raw: raw * scale + offset < below
 
 
 class ScanDecoder:
@@ -116,55 +79,29 @@ class ScanDecoder:
 
     def __init__(self, profile: Profile, capacity: int = 64) -> None:
         self.counts = DecodeCounts()
+        self._layout = Layout(profile)
+        self._messages = self._layout.messages
+        self.ids = frozenset(self._messages)
         self._period_ns, self._timeout_ns = profile.period_ns, profile.timeout_ns
         self._latency_ns = profile.latency_ns
         self._resync_ns = RESYNC_PERIODS * profile.period_ns
-        self._header = profile.header is not None
-
-        # raw values of an object frame in this order: key, new, state components, conditions; the
-        # key is the object's id, or without a header the counter of the scan
-        key = profile.id if profile.id is not None else profile.counter
-        parts = [(i, part) for i, part in enumerate(profile.state) if part]
-        names = [key, *([profile.new] if profile.new else [])]
-        self._first_component = len(names)
-        names += [part.signal for _, part in parts]
-        self._first_condition = len(names)
-        names += [condition.signal for condition in profile.valid_if]
-        self._messages = {
-            message.frame_id: _Message(profile, message, names, slot)
-            for slot, message in enumerate(profile.messages)
-        }
-
-        # load_profile has made sure that the scaling is the same in all object messages
-        first = profile.messages[0]
-        scalings = [field(find_signal(first, name, profile.path, profile.dbc)) for name in names]
-        self._key = scalings[0]
-        self._has_new = profile.new is not None
-        self._components = [
-            (i, *scaling[1:], part.sign, part.offset)
-            for (i, part), scaling in zip(parts, scalings[self._first_component :], strict=False)
-        ]
-        self._conditions = [
-            (self._first_condition + k, _condition(condition, scalings[self._first_condition + k]))
-            for k, condition in enumerate(profile.valid_if)
-        ]
-        if profile.header is not None:
-            message = profile.header.message
-            names = [profile.header.count, profile.counter]
-            self._messages[message.frame_id] = _Message(profile, message, names, -1)
-            self._count = field(message.get_signal_by_name(profile.header.count))
-        self.ids = frozenset(self._messages)
 
         self._scan = Scan(capacity)
-        self._capacity = capacity
-        for i, part in parts:
-            self._scan.std[:, i] = part.std
+        for state, part in enumerate(profile.state):
+            if part is not None:
+                self._scan.std[:, state] = part.std
         self._mask = tuple(part is not None for part in profile.state)
 
         self._open = False
-        self._slots = 0 if self._header else len(profile.messages)
-        self._begin(0, -1, 0)
-        self._open = False
+        self._start_ns = self._deadline_ns = 0
+        self._counter = self._expected = self._arrived = 0
+        self._damaged = False
+        self._seen: set[int] = set()
+        self._ids: list[int] = []
+        self._new: list[bool] = []
+        self._z: list[list[float]] = []
+        self._valid: list[tuple[bool, ...]] = []
+        # of the scan before the open one
         self._ended_counter, self._ended_ns = -1, 0
 
     def feed(self, frame: Frame) -> Scan | None:
@@ -183,9 +120,9 @@ class ScanDecoder:
             return None
         finished = self.flush(t_ns)
         raws = message.read(data)
-        if message.slot < 0:
+        if message.slot == HEADER:
             finished = self._take_header(t_ns, raws) or finished
-        elif self._header:
+        elif not self._layout.slots:
             if not self._open:
                 counts.stray += 1
                 return finished
@@ -197,7 +134,7 @@ class ScanDecoder:
             if self._open and raws[0] != self._counter:
                 finished = self._finish()
             if not self._open:
-                self._begin(t_ns, raws[0], self._slots)
+                self._begin(t_ns, raws[0], self._layout.slots)
             if message.slot in self._seen:
                 counts.duplicates += 1
                 return finished
@@ -213,7 +150,7 @@ class ScanDecoder:
             return self._finish()
         return None
 
-    def _passes(self, message: _Message, frame: Frame) -> bool:
+    def _passes(self, message: CompiledMessage, frame: Frame) -> bool:
         """Kind, length, checksum and counter; counts what fails."""
         counts = self.counts
         if frame.flags & _UNSUITABLE:
@@ -251,8 +188,8 @@ class ScanDecoder:
 
     def _take_header(self, t_ns: int, raws: tuple[int, ...]) -> Scan | None:
         finished = self._finish() if self._open else None
-        count = raws[0]
-        if not self._count.low <= count <= self._count.high:
+        count, (low, high) = raws[0], self._layout.count_range
+        if not low <= count <= high:
             self.counts.out_of_range += 1
             return finished
         self.counts.used += 1
@@ -263,25 +200,24 @@ class ScanDecoder:
         """One object frame of the open scan; all of it, or nothing but a count."""
         counts = self.counts
         self._arrived += 1
-        for index, holds in self._conditions:
+        layout = self._layout
+        for index, holds in layout.conditions:
             if not holds(raws[index]):
                 counts.empty += 1
                 return
         values = [0.0, 0.0, 0.0, 0.0]
         missing = []
-        index = self._first_component
-        for i, scale, offset, low, high, absent, sign, shift in self._components:
+        for index, state, scale, offset, low, high, absent, sign, shift in layout.components:
             raw = raws[index]
-            index += 1
             if raw == absent:
-                missing.append(i)
+                missing.append(state)
             elif low <= raw <= high:
-                values[i] = (raw * scale + offset) * sign + shift
+                values[state] = (raw * scale + offset) * sign + shift
             else:
                 self._reject("out_of_range")
                 return
-        if self._header:
-            if not self._key.low <= key <= self._key.high:
+        if not layout.slots:
+            if not layout.key_range[0] <= key <= layout.key_range[1]:
                 self._reject("out_of_range")
                 return
             if key in self._seen:
@@ -289,18 +225,18 @@ class ScanDecoder:
                 return
             self._seen.add(key)
         counts.not_available += len(missing)
-        if len(missing) == len(self._components):
+        if len(missing) == len(layout.components):
             counts.empty += 1
             return
-        if len(self._ids) == self._capacity:
+        if len(self._ids) == self._scan.capacity:
             self._reject("overflow")
             return
         mask = self._mask
         if missing:
-            mask = tuple(there and i not in missing for i, there in enumerate(mask))
+            mask = tuple(there and state not in missing for state, there in enumerate(mask))
         counts.used += 1
         self._ids.append(key)
-        self._new.append(self._has_new and raws[1] != 0)
+        self._new.append(layout.new is not None and raws[layout.new] != 0)
         self._z.append(values)
         self._valid.append(mask)
 
@@ -309,15 +245,16 @@ class ScanDecoder:
         self._damaged = True
 
     def _begin(self, t_ns: int, counter: int, expected: int) -> None:
+        if self._ended_counter >= 0 and abs(t_ns - self._ended_ns) <= self._resync_ns:
+            step = (counter - self._ended_counter) % self._layout.scan_modulus
+            # a larger step is that of a sender that has started anew
+            if 1 < step <= RESYNC_PERIODS:
+                self.counts.lost_scans += step - 1
         self._open = True
         self._start_ns, self._deadline_ns = t_ns, t_ns + self._timeout_ns
         self._counter, self._expected, self._arrived = counter, expected, 0
         self._damaged = False
-        self._seen: set[int] = set()
-        self._ids: list[int] = []
-        self._new: list[bool] = []
-        self._z: list[list[float]] = []
-        self._valid: list[tuple[bool, ...]] = []
+        self._seen, self._ids, self._new, self._z, self._valid = set(), [], [], [], []
 
     def _finish(self) -> Scan:
         """Close the open scan and write it to the buffer."""

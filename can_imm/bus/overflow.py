@@ -23,6 +23,7 @@ class QueueWatch:
 
     def __init__(self, bus: can.BusABC) -> None:
         self._socket: socket.socket | None = None
+        self._before = 0
         try:
             fd = bus.fileno()
         except NotImplementedError:
@@ -32,9 +33,13 @@ class QueueWatch:
                 self._socket = socket.socket(fileno=os.dup(fd))
             except OSError:
                 return  # a device file
+        self._before = self._total()
 
     def drops(self) -> int:
-        """Frames dropped since the bus was opened."""
+        """Frames dropped since this object was made."""
+        return self._total() - self._before
+
+    def _total(self) -> int:
         if self._socket is None:
             return 0
         try:

@@ -7,7 +7,7 @@ import gzip
 import io
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,7 +18,16 @@ from can_imm.bus.errors import one_line
 from can_imm.bus.frame import Frame, from_message
 from can_imm.types import CanImmError
 
-LOG_SUFFIXES = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
+_READERS: dict[str, Any] = {
+    ".asc": can.ASCReader,
+    ".blf": can.BLFReader,
+    ".csv": can.CSVReader,
+    ".db": can.SqliteReader,
+    ".mf4": can.MF4Reader,
+    ".trc": can.TRCReader,
+}
+
+LOG_SUFFIXES = tuple(sorted((*_READERS, ".log")))
 """Log formats; the text ones (.asc .csv .log .trc) also with .gz."""
 
 _GZ_SUFFIXES = (".asc", ".csv", ".log", ".trc")
@@ -70,15 +79,18 @@ class LogSource:
             self._file: BinaryIO = self.path.open("rb")
         except OSError as error:
             raise CanImmError(f"{self.path}: {one_line(error)}") from error
-        self._text: Any = None
-        self._reader: Any = None
+        opened: Any = self._file
+        if packed:
+            opened = gzip.GzipFile(fileobj=self._file)
         if suffix == ".log":
-            unpacked: Any = gzip.GzipFile(fileobj=self._file) if packed else self._file
             # "replace" keeps garbage bytes from being more than a bad line
-            self._text = io.TextIOWrapper(unpacked, "ascii", "replace", newline="\n")
-            self._frames = self._candump()
+            opened = io.TextIOWrapper(opened, "ascii", "replace", newline="\n")
+            self._frames = self._candump(opened)
         else:
-            self._frames = self._messages()
+            if suffix in _GZ_SUFFIXES:
+                opened = io.TextIOWrapper(opened, "utf-8", "replace")
+            self._frames = self._messages(suffix, opened)
+        self._opened = opened
 
     def __iter__(self) -> Iterator[Frame]:
         return self._checked()
@@ -91,25 +103,16 @@ class LogSource:
 
     def close(self) -> None:
         """Close the file; the iteration does so at its end."""
-        for item in (self._text, self._file):
-            if item is not None:
-                item.close()
-        if self._reader is not None:
-            self._reader.stop()
+        self._frames.close()
+        self._opened.close()
+        self._file.close()
 
     def progress(self) -> float | None:
-        """How much of the file has been read, 0 to 1; None where the format does not tell."""
-        file: Any = self._file
-        if self._reader is not None:
-            file = getattr(self._reader, "file", None)
-            file = getattr(file, "buffer", file)
-            file = getattr(file, "fileobj", None) or file
-        if file is None or self._size == 0:
-            return None
-        try:
-            return min(1.0, float(file.tell() / self._size))
-        except (OSError, ValueError, AttributeError):
-            return 1.0 if getattr(file, "closed", False) else None
+        """How much of the file has been read, 0 to 1; None where the format does not tell (.db)."""
+        if self._file.closed:
+            return 1.0
+        position = self._file.tell()
+        return min(1.0, position / self._size) if position else None
 
     def _checked(self) -> Iterator[Frame]:
         any_frame = False
@@ -125,9 +128,9 @@ class LogSource:
             bad = f"; {self.bad_lines} lines are not frames" if self.bad_lines else ""
             raise CanImmError(self.damage or f"{self.path}: no CAN frames in this log{bad}")
 
-    def _candump(self) -> Iterator[Frame]:
+    def _candump(self, lines: Iterable[str]) -> Generator[Frame, None, None]:
         parse = candump.parse
-        for line in self._text:
+        for line in lines:
             frame = parse(line)
             if frame is not None:
                 yield frame
@@ -136,11 +139,14 @@ class LogSource:
             elif line.strip():
                 self.bad_lines += 1
 
-    def _messages(self) -> Iterator[Frame]:
-        self._file.close()
+    def _messages(self, suffix: str, opened: Any) -> Generator[Frame, None, None]:
         if self._size:
-            self._reader = can.LogReader(self.path)
-            yield from map(from_message, self._reader)
+            # sqlite3 opens by name; the others get our file, which is closed whatever happens
+            reader = _READERS[suffix](self.path if suffix == ".db" else opened)
+            try:
+                yield from map(from_message, reader)
+            finally:
+                reader.stop()
 
 
 class BusGone(CanImmError):  # noqa: N818 - it says what happened

@@ -19,7 +19,7 @@ from contextlib import ExitStack
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from can_imm.cli.bus_options import add_bus_arguments, open_bus_from
+from can_imm.cli.bus_options import add_bus_arguments, bus_name, open_bus_from
 from can_imm.cli.detection import add_detector_arguments, build, print_summary, summary_console
 
 if TYPE_CHECKING:
@@ -55,14 +55,17 @@ def run(args: argparse.Namespace) -> int:
     from can_imm.runtime.loop import run as run_loops
     from can_imm.types import CanImmError
 
-    detection = build(args)
-    health = detection.health
     with ExitStack() as stack:
-        stack.callback(detection.close)
         bus = stack.enter_context(open_bus_from(args))
+        source, sink = BusSource(bus), BusSink(bus)
+        detection = build(args)
+        stack.callback(detection.close)
+        health = detection.health
+        # What came while the estimators were made ready is old.
+        while source.recv(0.0) is not None:
+            pass
         queue = QueueWatch(bus)
         stack.callback(queue.close)
-        source, sink = BusSource(bus), BusSink(bus)
         own = EchoFilter(source, sink, health)
         log = LogSink(args.log) if args.log else None
         if log is not None:
@@ -76,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
         # What exists now stays; a full collection would stop the loop for tens of milliseconds.
         gc.collect()
         gc.freeze()
-        _say(f"listening on {bus.channel_info}; Ctrl-C ends it")
+        _say(f"listening on {bus_name(args, bus)}; Ctrl-C ends it")
         gone = None
         try:
             run_loops([loop], stop=lambda: trouble.check() or stop())

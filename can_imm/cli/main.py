@@ -23,7 +23,7 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from types import FrameType
 from typing import Any
 
@@ -130,12 +130,15 @@ class _Terminated(BaseException):
     """SIGTERM arrived; raised so that files are closed and the terminal is left in order."""
 
 
-class _sigterm_raises(contextlib.AbstractContextManager[None]):  # noqa: N801
-    def __enter__(self) -> None:
-        def handler(number: int, frame: FrameType | None) -> None:
-            raise _Terminated
+@contextlib.contextmanager
+def _sigterm_raises() -> Iterator[None]:
+    def handler(number: int, frame: FrameType | None) -> None:
+        raise _Terminated
 
-        self.previous = signal.signal(signal.SIGTERM, handler)
-
-    def __exit__(self, *exc: object) -> None:
-        signal.signal(signal.SIGTERM, self.previous)
+    previous = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGTERM, handler)
+    try:
+        yield
+    finally:
+        for number, action in previous.items():
+            signal.signal(number, action)

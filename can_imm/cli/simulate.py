@@ -19,7 +19,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from can_imm.cli.bus_options import add_bus_arguments, bus_wanted, open_bus_from
+from can_imm.cli.bus_options import add_bus_arguments, bus_name, bus_wanted, open_bus_from
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
             outputs.append(BusSink(bus))
             clock = WallClock()
             start_ns = -(-(clock.now_ns() + LEAD_NS) // STEP_NS) * STEP_NS
-            where = f"on {bus.channel_info}"
+            where = f"on {bus_name(args, bus)}"
         else:
             start_ns = 0
             where = f"into {args.log or args.truth}"

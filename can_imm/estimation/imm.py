@@ -319,7 +319,9 @@ def update_mode_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def keep_combined_(n: int, obj: Any, x: FloatArray, P: FloatArray) -> None:  # pragma: no cover - compiled
+def keep_combined_(
+    n: int, obj: Any, x: FloatArray, P: FloatArray
+) -> None:  # pragma: no cover - compiled
     """An impossible mode takes over the combined estimate, so that it can start from there."""
     for s in range(n):
         x[s] = obj.mean[s]
@@ -407,8 +409,7 @@ def combine_(bank: Any, obj: Any) -> None:  # pragma: no cover - compiled
             v = 0.0
             for j in range(n_modes):
                 v += obj.mu[j] * (
-                    obj.P[j, s, t]
-                    + (obj.x[j, s] - obj.mean[s]) * (obj.x[j, t] - obj.mean[t])
+                    obj.P[j, s, t] + (obj.x[j, s] - obj.mean[s]) * (obj.x[j, t] - obj.mean[t])
                 )
             obj.cov[s, t] = v
             obj.cov[t, s] = v
@@ -575,7 +576,9 @@ def birth_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def extrapolate_(bank: Any, obj: Any, m: int, x: FloatArray, P: FloatArray, mu: FloatArray, work: Any) -> None:
+def extrapolate_(
+    bank: Any, obj: Any, m: int, x: FloatArray, P: FloatArray, mu: FloatArray, work: Any
+) -> None:
     """Combined estimate and mode probabilities ``m`` steps after the last measurement.
 
     Nothing is mixed and nothing of ``obj`` changes: each mode is predicted on its own, mu moves

@@ -110,7 +110,12 @@ class _Table:
         return value
 
     def number(
-        self, key: str, default: float | None = None, low: float = -math.inf, *, open_low: bool = False
+        self,
+        key: str,
+        default: float | None = None,
+        low: float = -math.inf,
+        *,
+        open_low: bool = False,
     ) -> float:
         value = float(self.take(key, float, default))
         if math.isnan(value) or value < low or (open_low and value <= low):
@@ -155,16 +160,12 @@ def _axis(table: _Table, has_acceleration: bool) -> tuple[FloatArray, FloatArray
         W[2, 2] = 2.0 * sigma**2 / tau
         W[1, 1] = table.number("q", 0.0, low=0.0)
     else:
-        raise table.error(
-            f"unknown model '{kind}' (constant-velocity, singer, equation-33)"
-        )
+        raise table.error(f"unknown model '{kind}' (constant-velocity, singer, equation-33)")
     table.done()
     return A, W, kind
 
 
-def _motion(
-    mode: _Table, states: list[str], dt: float
-) -> tuple[FloatArray, FloatArray]:
+def _motion(mode: _Table, states: list[str], dt: float) -> tuple[FloatArray, FloatArray]:
     """One-step F and Q of a mode: the two axes are independent."""
     n = len(states)
     F = np.eye(n)
@@ -297,8 +298,12 @@ def _fill_particle(record: Any, table: _Table) -> int:
 
 
 def _transitions(
-    table: _Table, names: list[str], dwell: list[float], following: list[dict[str, Any]],
-    step_s: float, n_steps: int,
+    table: _Table,
+    names: list[str],
+    dwell: list[float],
+    following: list[dict[str, Any]],
+    step_s: float,
+    n_steps: int,
 ) -> FloatArray:
     """Pi[m] from the modes' dwell times, or from a printed matrix and its period."""
     if "matrix" not in table.data:
@@ -371,7 +376,10 @@ def bank_from_dict(
     modes = top.take("mode", list)
     if not modes:
         raise top.error("there is no [[mode]]")
-    names = [m.get("name", f"#{i + 1}") if isinstance(m, dict) else f"#{i + 1}" for i, m in enumerate(modes)]
+    names = [
+        m.get("name", f"#{i + 1}") if isinstance(m, dict) else f"#{i + 1}"
+        for i, m in enumerate(modes)
+    ]
     mode_tables = [_Table(m, f"{where}, mode '{n}'") for n, m in zip(names, modes, strict=True)]
     if len(set(names)) != len(names):
         raise top.error("two modes have the same name")
@@ -393,7 +401,9 @@ def bank_from_dict(
         variance = top.numbers("measurement_variance", 4)
     n_particles = 0
     if "particles" in top.data:
-        n_particles = _fill_particle(record, _Table(top.take("particles", dict), f"{where}, particles"))
+        n_particles = _fill_particle(
+            record, _Table(top.take("particles", dict), f"{where}, particles")
+        )
     from_matrix = "transition" in top.data
     transition = _Table(top.take("transition", dict, {}), f"{where}, transition")
 
@@ -437,5 +447,14 @@ def bank_from_dict(
     record["mu0"][:m] = stationary(Pi[min(10, n_steps - 1)])
     top.done()
     return ModeBank(
-        name, tuple(names), tuple(manoeuvres), direction, array, n, n_particles, step_ns, width, variance
+        name,
+        tuple(names),
+        tuple(manoeuvres),
+        direction,
+        array,
+        n,
+        n_particles,
+        step_ns,
+        width,
+        variance,
     )

@@ -80,8 +80,7 @@ def _detect(
         )
         row.update({(object_id, int(t)): k for k, t in enumerate(one.t_ns)})
     due = {scan.t_ns: scan for scan in scans}
-    step_ns = observations[0].truth.dt_ns
-    for t_ns in range(0, max(due) + 1, step_ns):
+    for t_ns in range(0, max(due) + 1, modes.step_ns):
         n = detector.step(t_ns, due.get(t_ns))
         for report in detector.reports[:n]:
             object_id = int(report["object_id"])

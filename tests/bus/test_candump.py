@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import io
+
 import can
 import pytest
 from hypothesis import given
@@ -21,7 +23,7 @@ LINES = [
     ("(1700000000.123456) c 123##3aabb", Frame(T, 0x123, b"\xaa\xbb", "c", FD | BRS | ESI)),
     ("(1700000000.123456) c 123##0" + "00" * 64, Frame(T, 0x123, bytes(64), "c", FD)),
     ("(1700000000.123456) c 20000080#0000000000000000", Frame(T, 0x80, bytes(8), "c", ERROR)),
-    ("(1700000000.123456) c 123#0011223344556677_E", Frame(T, 0x123, bytes.fromhex("0011223344556677"), "c")),
+    ("(1700000000.123456) c 123#0000000000000000_E", Frame(T, 0x123, bytes(8), "c")),
     ("(0.5)  can1   210#", Frame(500_000_000, 0x210, b"", "can1")),
     ("(0.123456789) can1 210#", Frame(123_456_000, 0x210, b"", "can1")),
 ]  # fmt: skip
@@ -105,8 +107,6 @@ def test_what_is_written_is_read_back(frame):
 
 @given(frames())
 def test_python_can_reads_the_same(frame):
-    import io
-
     if frame.flags & ERROR or len(frame.data) > 64:
         return
     [message] = list(can.CanutilsLogReader(io.StringIO(format_frame(frame))))

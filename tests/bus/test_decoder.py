@@ -118,6 +118,15 @@ def test_lost_frames_are_counted_by_the_counter_across_its_wrap(bench, radar):
     assert len(bench.scans) == 3
 
 
+def test_lost_scans_are_counted_by_the_scan_counter(bench, radar):
+    for step in (1, 3, 65533, 2, 65000):
+        bench.feed(radar.scan(0))
+        bench.t_ns += 100 * MS
+        radar.scans = (radar.scans + step - 1) % 65536
+    bench.feed(radar.scan(0))
+    assert bench.counts.lost_scans == 3
+
+
 def test_after_a_long_silence_any_counter_will_do(bench, radar):
     bench.feed(radar.scan(1), radar.object(1))
     radar.counters = {"RadarScan": 0, "RadarObject": 0}

@@ -37,8 +37,9 @@ def scan_of(*rows, ids=None):
 def report_of(**changes):
     report = np.zeros(1, REPORT_DTYPE)
     values = {
-        "object_id": 5, "age": 17, "manoeuvre": Manoeuvre.LANE_CHANGE, "second": Manoeuvre.KEEP_LEFT,
-        "direction": -1, "lane": 1, "probability": 0.8127, "second_probability": 0.1,
+        "object_id": 5, "age": 17, "manoeuvre": Manoeuvre.LANE_CHANGE,
+        "second": Manoeuvre.KEEP_LEFT, "direction": -1, "lane": 1,
+        "probability": 0.8127, "second_probability": 0.1,
         "x": (51.237, -1.512, 1.444, 0.73),
     }  # fmt: skip
     for name, value in {**values, **changes}.items():
@@ -107,9 +108,8 @@ def test_a_scan_comes_back_within_half_a_step(rows):
 
 def test_manoeuvre_frames(own_db):
     encoder = ManoeuvreEncoder()
-    reports = np.concatenate(
-        [report_of(), report_of(object_id=126, lane=-1, coasting=True, age=9999)]
-    )
+    odd = report_of(object_id=126, lane=-1, coasting=True, age=9999)
+    reports = np.concatenate([report_of(), odd])
     frames = [frame for k in range(20) for frame in encoder.encode(reports, k * 10 * MS)]
     check_protection(frames)
     assert [f.id for f in frames[:4]] == [0x310, 0x311] * 2

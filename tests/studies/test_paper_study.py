@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -111,7 +112,7 @@ def test_the_detector_is_stepped_every_10_ms_and_its_reports_go_to_their_objects
     ]
     truths = [dataclasses.replace(truth, object_id=i) for i in (1, 2)]
     seen = [observe(one, scans) for one in truths]
-    first, second = systems._detect(None, scans, seen, seed=0)
+    first, second = systems._detect(SimpleNamespace(step_ns=10_000_000), scans, seen, seed=0)
     # the echo says nothing of an object that it misses: unknown
     assert first.manoeuvre.tolist() == [3, 3, 0]
     assert first.x[:, 0] == pytest.approx([10.0, 11.0, math.nan], nan_ok=True)

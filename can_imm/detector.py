@@ -1,0 +1,329 @@
+"""The detector: object slots around the estimator, and the order of operations of one step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from can_imm.estimation import imm
+from can_imm.estimation.particles import N_COLUMNS
+from can_imm.manoeuvres import ModeBank
+from can_imm.reporting import extrapolate_all_, fill_reports_
+from can_imm.types import REPORT_DTYPE, CanImmError, FloatArray, IntArray, Scan
+
+
+@dataclass(slots=True)
+class DetectorCounts:
+    """What happened since the start; every scan and every measurement ends up in one place.
+
+    Attributes:
+        scans: scans that were used.
+        late_scans: older than the last used one, or older than the table of elapsed steps reaches.
+        repeated_scans: same time and counter as the last used one.
+        missed_scans: gaps in the sensor's scan counter.
+        measurements: object measurements that updated a track or began one.
+        outliers: measurements too far from anything the object could do; the track coasts.
+        invalid: measurements that are not finite, or without any valid component.
+        numeric_failures: cycles that gave no finite result; the track starts anew.
+        overflow: measurements for which no slot was free.
+        duplicates: second and later measurements of one id in one scan.
+        births, deaths: tracks begun and ended.
+        reused_ids: births because the sensor said that an id names another object, or because a
+            track was an outlier for too long.
+    """
+
+    scans: int = 0
+    late_scans: int = 0
+    repeated_scans: int = 0
+    missed_scans: int = 0
+    measurements: int = 0
+    outliers: int = 0
+    invalid: int = 0
+    numeric_failures: int = 0
+    overflow: int = 0
+    duplicates: int = 0
+    births: int = 0
+    deaths: int = 0
+    reused_ids: int = 0
+
+
+class Detector:
+    """Runs the constrained IMM for every object; one call per step of the loop.
+
+    Everything is allocated and compiled here, before the clock starts.
+
+    Attributes:
+        reports: (capacity,) of `REPORT_DTYPE`; the first n rows, n as returned by `step`, are what
+            is said after a scan, in the order of the slots.
+        predicted: (capacity,) of `REPORT_DTYPE`: `predict` writes the first `n_tracked` rows.
+        counts: `DetectorCounts`.
+        n_tracked: number of objects tracked now.
+
+    Args:
+        bank: mode bank; its step is the loop's.
+        capacity: object slots.
+        seed: of the particles' random numbers.
+        coast_s: a track that was not measured for longer than this ends [s].
+        gate: a measurement is an outlier if its squared distance from what is possible
+            (`imm.surprise`) is larger; chi-square with 4 degrees of freedom.
+        max_outliers: after so many outliers in a row the id is taken to name another object.
+        counter_modulus: the scan counter wraps to 0 here.
+    """
+
+    def __init__(
+        self,
+        bank: ModeBank,
+        *,
+        capacity: int = 64,
+        seed: int = 0,
+        coast_s: float = 0.5,
+        gate: float = 25.0,
+        max_outliers: int = 3,
+        counter_modulus: int = 16,
+    ) -> None:
+        if capacity < 1:
+            raise CanImmError(f"the detector needs at least one object slot, not {capacity}")
+        self.bank = bank
+        self.capacity = capacity
+        self.counts = DetectorCounts()
+        self.reports: np.ndarray[Any, np.dtype[np.void]] = np.zeros(capacity, REPORT_DTYPE)
+        self.predicted: np.ndarray[Any, np.dtype[np.void]] = np.zeros(capacity, REPORT_DTYPE)
+        self._step_ns = bank.step_ns
+        self._coast_steps = min(int(coast_s * 1e9) // bank.step_ns, imm.MAX_STEPS - 1)
+        self._gate = gate
+        self._max_outliers = max_outliers
+        self._modulus = counter_modulus
+        self._rng = np.random.default_rng(seed)
+        self._objects = np.zeros(capacity, imm.OBJECT_DTYPE)
+        self._work = np.zeros(1, imm.WORK_DTYPE)
+        self._particles: FloatArray = np.zeros((capacity, bank.n_particles, N_COLUMNS))
+        self._spare: FloatArray = np.zeros((bank.n_particles, N_COLUMNS))
+        self._weights: FloatArray = np.zeros(bank.n_particles)
+        # per slot
+        self._id: IntArray = np.full(capacity, -1, np.int32)
+        self._updated = np.zeros(capacity, np.int64)  # step number of the last measurement
+        self._age: IntArray = np.zeros(capacity, np.int32)
+        self._outliers: IntArray = np.zeros(capacity, np.int32)
+        self._measured = np.zeros(capacity, np.bool_)
+        self._slot_of: dict[int, int] = {}
+        self._free = list(range(capacity - 1, -1, -1))
+        # per row of a scan; a scan may hold more rows than there are slots
+        self._slot: IntArray = np.zeros(0, np.int32)
+        self._steps: IntArray = np.zeros(0, np.int32)
+        self._status = np.zeros(0, np.int8)
+        self._r: FloatArray = np.zeros((0, 4))
+        self._last_t_ns = -1
+        self._last_counter = -1
+        self._warm_up()
+
+    @property
+    def n_tracked(self) -> int:
+        """Number of objects tracked now."""
+        return len(self._slot_of)
+
+    def _grow_rows(self, n: int) -> None:
+        """Room for scans of up to n rows; happens once, for the first scan of a decoder."""
+        if len(self._slot) < n:
+            self._slot = np.zeros(n, np.int32)
+            self._steps = np.zeros(n, np.int32)
+            self._status = np.zeros(n, np.int8)
+            self._r = np.zeros((n, 4))
+
+    def _warm_up(self) -> None:
+        """Compile, or load from the cache, every kernel that `step` and `predict` call."""
+        scan = Scan(1)
+        self._grow_rows(self.capacity)
+        self._slot[0] = -1
+        self._process(scan, 1, 0.0)
+        fill_reports_(
+            self._objects,
+            self._id,
+            self._age,
+            self._measured,
+            self.bank.record,
+            0,
+            self.reports,
+        )
+        self.predict(0)
+
+    def step(self, t_ns: int, scan: Scan | None) -> int:
+        """One step of the loop.
+
+        Args:
+            t_ns: time of the step [ns], a multiple of the step time.
+            scan: what the sensor finished since the last step, or None.  Its time may lie before
+                ``t_ns`` by its age; it is not kept.
+
+        Returns:
+            The number n of rows of `reports` that were written: all tracked objects after a scan
+            that was used, else 0.
+        """
+        now = t_ns // self._step_ns
+        if scan is None or not self._accept(t_ns, scan):
+            if self._slot_of:
+                self._bury(now)
+            return 0
+        self._grow_rows(scan.n)
+        n = scan.n
+        self._measured[:] = False
+        self._assign(scan, now)
+        np.square(scan.std[:n], out=self._r[:n])
+        if self.bank.measurement_variance is not None:
+            self._r[:n] = self.bank.measurement_variance
+        self._process(scan, n, (t_ns - scan.t_ns) * 1e-9)
+        self._settle(scan, now)
+        self._bury(now)
+        return self._report(scan.t_ns, now)
+
+    def predict(self, t_ns: int) -> int:
+        """Extrapolate every tracked object to the step at ``t_ns`` into `predicted`.
+
+        Returns:
+            The number of rows written, `n_tracked`.
+        """
+        return int(
+            extrapolate_all_(
+                self._objects,
+                self._id,
+                self._age,
+                self._updated,
+                self.bank.record,
+                self._work,
+                t_ns,
+                t_ns // self._step_ns,
+                self.predicted,
+            )
+        )
+
+    def _accept(self, t_ns: int, scan: Scan) -> bool:
+        """Late and repeated scans are counted and not used: a filter cannot go back in time."""
+        if self._last_t_ns >= 0:
+            if scan.t_ns == self._last_t_ns and scan.counter == self._last_counter:
+                self.counts.repeated_scans += 1
+                return False
+            if scan.t_ns <= self._last_t_ns:
+                self.counts.late_scans += 1
+                return False
+        if t_ns - scan.t_ns >= self._coast_steps * self._step_ns:
+            self.counts.late_scans += 1
+            return False
+        if scan.counter >= 0 and self._last_counter >= 0:
+            self.counts.missed_scans += (scan.counter - self._last_counter - 1) % self._modulus
+        self._last_t_ns, self._last_counter = scan.t_ns, scan.counter
+        self.counts.scans += 1
+        return True
+
+    def _assign(self, scan: Scan, now: int) -> None:
+        """Give every row of the scan its slot (-1: none) and the steps since its last update."""
+        seen: set[int] = set()
+        finite = np.isfinite(scan.z[: scan.n]) & np.isfinite(scan.std[: scan.n])
+        usable = scan.valid[: scan.n] & finite & (scan.std[: scan.n] > 0.0)
+        for k in range(scan.n):
+            self._slot[k] = -1
+            name = int(scan.ids[k])
+            if name in seen:
+                self.counts.duplicates += 1
+                continue
+            seen.add(name)
+            if not usable[k].any() or (scan.valid[k] & ~usable[k]).any():
+                self.counts.invalid += 1
+                continue
+            slot = self._slot_of.get(name)
+            if slot is not None and scan.new[k]:
+                self.counts.reused_ids += 1
+                self._end(name)
+                slot = None
+            elif slot is not None and now - self._updated[slot] > self._coast_steps:
+                self._end(name)
+                slot = None
+            if slot is None:
+                if not self._free:
+                    self.counts.overflow += 1
+                    continue
+                slot = self._free.pop()
+                self._slot_of[name] = slot
+                self._id[slot] = name
+                self._age[slot] = 0
+                self._outliers[slot] = 0
+                self.counts.births += 1
+            self._slot[k] = slot
+            self._steps[k] = -1 if self._age[slot] == 0 else now - self._updated[slot]
+
+    def _process(self, scan: Scan, n: int, age: float) -> None:
+        imm.process_scan_(
+            self.bank.record,
+            self._objects,
+            self._work,
+            n,
+            self._slot,
+            self._steps,
+            scan.z,
+            self._r,
+            scan.valid,
+            age,
+            self._gate,
+            self._particles,
+            self._spare,
+            self._weights,
+            self._rng,
+            self._status,
+        )
+
+    def _settle(self, scan: Scan, now: int) -> None:
+        """Act on what became of every measurement."""
+        for k in range(scan.n):
+            slot = int(self._slot[k])
+            if slot < 0:
+                continue
+            if self._status[k] == imm.OK:
+                self.counts.measurements += 1
+                self._updated[slot] = now
+                self._age[slot] += 1
+                self._outliers[slot] = 0
+                self._measured[slot] = True
+                continue
+            if self._status[k] == imm.OUTLIER:
+                self.counts.outliers += 1
+                self._outliers[slot] += 1
+                if self._outliers[slot] < self._max_outliers:
+                    continue
+                self.counts.reused_ids += 1
+            else:
+                self.counts.numeric_failures += 1
+            # The id's next measurement begins a new track.
+            self._end(int(self._id[slot]))
+
+    def _end(self, name: int) -> None:
+        slot = self._slot_of.pop(name)
+        self._id[slot] = -1
+        self._free.append(slot)
+        self.counts.deaths += 1
+
+    def _bury(self, now: int) -> None:
+        """End the tracks that coasted for too long."""
+        for name, slot in list(self._slot_of.items()):
+            if now - self._updated[slot] > self._coast_steps:
+                self._end(name)
+
+    def _report(self, t_ns: int, now: int) -> int:
+        """Reports of all tracks; coasting ones are extrapolated."""
+        n = int(
+            fill_reports_(
+                self._objects,
+                self._id,
+                self._age,
+                self._measured,
+                self.bank.record,
+                t_ns,
+                self.reports,
+            )
+        )
+        coasting = self.reports["coasting"]
+        if coasting[:n].any():
+            self.predict(now * self._step_ns)
+            for k in np.flatnonzero(coasting[:n]):
+                self.reports[k] = self.predicted[k]
+                self.reports["t_ns"][k] = t_ns
+        return n

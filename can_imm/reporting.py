@@ -1,0 +1,114 @@
+"""Kernels that turn estimator states into reports."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from can_imm.estimation.imm import extrapolate_
+from can_imm.types import FloatArray, Manoeuvre
+
+_LANE_CHANGE = int(Manoeuvre.LANE_CHANGE)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def conclude_(bank: Any, mu: FloatArray, mean: FloatArray, cov: FloatArray, report: Any) -> None:
+    """Fill one report from mode probabilities and the combined estimate.
+
+    A manoeuvre's probability is the sum over its modes; the direction of a lane change is that of
+    its likelier modes; the lane is the nearer of the two.
+
+    Args:
+        bank: record of `imm.BANK_DTYPE`.  mu: (M,).  mean: (n,).  cov: (n, n).
+    """
+    for i in range(report.p.shape[0]):
+        report.p[i] = 0.0
+    turn = 0.0
+    for j in range(bank.n_modes):
+        report.p[bank.manoeuvre[j]] += mu[j]
+        turn += mu[j] * bank.direction[j]
+    best = 1
+    for i in range(2, report.p.shape[0]):
+        if report.p[i] > report.p[best]:
+            best = i
+    second = 1 if best != 1 else 2
+    for i in range(1, report.p.shape[0]):
+        if i != best and report.p[i] > report.p[second]:
+            second = i
+    report.manoeuvre = best
+    report.second = second
+    report.probability = report.p[best]
+    report.second_probability = report.p[second]
+    report.direction = 0
+    if best == _LANE_CHANGE:
+        report.direction = 1 if turn > 0.0 else -1
+        if turn == 0.0:
+            report.direction = 1 if mean[3] >= 0.0 else -1
+    report.lane = 1 if mean[2] > 0.5 * bank.lane_width else 0
+    for s in range(4):
+        report.x[s] = mean[s]
+        for t in range(4):
+            report.cov[s, t] = cov[s, t]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def fill_reports_(
+    objects: Any, ids: Any, age: Any, measured: Any, bank: Any, t_ns: int, reports: Any
+) -> int:
+    """Reports of all slots in use, in slot order; returns their number.
+
+    Args:
+        objects: (capacity,) records.  ids: (capacity,) int32, -1 for a free slot.
+        age: (capacity,) int32.  measured: (capacity,) bool.  bank: (1,) records.
+        reports: (capacity,) of `REPORT_DTYPE`, written.
+    """
+    n = 0
+    for s in range(ids.shape[0]):
+        if ids[s] < 0:
+            continue
+        report = reports[n]
+        obj = objects[s]
+        report.t_ns = t_ns
+        report.object_id = ids[s]
+        report.age = age[s]
+        report.coasting = not measured[s]
+        conclude_(bank[0], obj.mu, obj.mean, obj.cov, report)
+        n += 1
+    return n
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def extrapolate_all_(
+    objects: Any,
+    ids: Any,
+    age: Any,
+    updated: Any,
+    bank: Any,
+    work: Any,
+    t_ns: int,
+    now: int,
+    reports: Any,
+) -> int:
+    """Like `fill_reports_`, but every object moved on to step ``now``.
+
+    Args:
+        updated: (capacity,) int64, step of the last measurement.
+    """
+    n = 0
+    longest = bank[0].Pi.shape[0] - 1
+    for s in range(ids.shape[0]):
+        if ids[s] < 0:
+            continue
+        report = reports[n]
+        w = work[0]
+        steps = min(max(now - updated[s], 0), longest)
+        extrapolate_(bank[0], objects[s], steps, w.tx, w.tP, w.w, w)
+        report.t_ns = t_ns
+        report.object_id = ids[s]
+        report.age = age[s]
+        report.coasting = True
+        conclude_(bank[0], w.w, w.tx, w.tP, report)
+        n += 1
+    return n
