@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numba
-import numpy as np
 
 from can_imm.estimation.imm import extrapolate_
 from can_imm.types import FloatArray, Manoeuvre

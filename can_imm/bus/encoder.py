@@ -13,13 +13,23 @@ from can_imm.bus.codec import Field, field, load_dbc
 from can_imm.bus.frame import Frame
 from can_imm.bus.profile import dbc_dir
 from can_imm.bus.protection import P01_COUNTERS, p01_data_id, p01_protect
-from can_imm.types import VX, VY, Scan, X, Y
+from can_imm.types import Scan
 
 DBC = dbc_dir() / "can_imm.dbc"
 
 STATUS_ID = 0x31F
 OUTPUT_IDS = frozenset({0x310, 0x311, STATUS_ID})
 """ManoeuvreState, ObjectEstimate, DetectorStatus."""
+
+DIRECTIONS = (0, 1, -1)
+"""Direction of a lane change (+1 left, -1 right) by the value on the bus."""
+
+_SENSOR_OBJECTS = range(64)
+_OUTPUT_OBJECTS = range(127)
+_REPORTED = (
+    "object_id", "direction", "lane", "probability", "second_probability", "x",
+    "coasting", "manoeuvre", "second", "age",
+)  # fmt: skip
 
 
 class DetectorState(IntEnum):
@@ -96,13 +106,18 @@ class RadarEncoder:
     def encode(self, scan: Scan, t_ns: int) -> list[Frame]:
         """Frames of ``scan``, stamped ``t_ns`` [ns]; components that are not valid are sent as not
         available."""
-        rows = [i for i in range(scan.n) if 0 <= scan.ids[i] <= 63]
-        self.left_out += scan.n - len(rows)
+        n = scan.n
+        columns = (scan.ids[:n], scan.new[:n], np.where(scan.valid[:n], scan.z[:n], np.nan))
+        rows = [
+            row
+            for row in zip(*(c.tolist() for c in columns), strict=True)
+            if row[0] in _SENSOR_OBJECTS
+        ]
+        self.left_out += n - len(rows)
         frames = [self._scan.encode(t_ns, len(rows), self._scans)]
         self._scans = (self._scans + 1) % 65536
-        for i in rows:
-            z = [scan.z[i, k] if scan.valid[i, k] else np.nan for k in (X, VX, Y, VY)]
-            frames.append(self._object.encode(t_ns, scan.ids[i], 1, scan.new[i], *z))
+        for object_id, new, z in rows:
+            frames.append(self._object.encode(t_ns, object_id, 1, new, *z))
         return frames
 
 
@@ -119,8 +134,8 @@ class ManoeuvreEncoder:
     def __init__(self) -> None:
         self._state = MessageEncoder(
             "ManoeuvreState",
-            ("ObjectId", "Coasting", "Manoeuvre", "SecondManoeuvre", "Direction", "Lane",
-             "Probability", "SecondProbability", "TrackAge"),
+            ("ObjectId", "Direction", "Lane", "Probability", "SecondProbability",
+             "Coasting", "Manoeuvre", "SecondManoeuvre", "TrackAge"),
         )  # fmt: skip
         self._estimate = MessageEncoder(
             "ObjectEstimate", ("ObjectId", "DistLong", "VrelLong", "DistLat", "VrelLat")
@@ -135,34 +150,19 @@ class ManoeuvreEncoder:
     def encode(self, reports: npt.NDArray[np.void], t_ns: int) -> list[Frame]:
         """ManoeuvreState and ObjectEstimate for each of the reports (REPORT_DTYPE)."""
         frames = []
-        for report in reports:
-            object_id = int(report["object_id"])
-            if not 0 <= object_id <= 126:
+        columns = (reports[name].tolist() for name in _REPORTED)
+        for object_id, direction, lane, p, second_p, x, *rest in zip(*columns, strict=True):
+            if object_id not in _OUTPUT_OBJECTS:
                 self.left_out += 1
                 continue
-            x, vx, y, vy = report["x"].tolist()
-            lane = int(report["lane"])
+            lane = lane if lane >= 0 else np.nan
+            where = DIRECTIONS.index(direction)
             frames.append(
-                self._state.encode(
-                    t_ns,
-                    object_id,
-                    int(report["coasting"]),
-                    int(report["manoeuvre"]),
-                    int(report["second"]),
-                    DIRECTIONS.index(int(report["direction"])),
-                    lane if lane >= 0 else np.nan,
-                    100.0 * float(report["probability"]),
-                    100.0 * float(report["second_probability"]),
-                    int(report["age"]),
-                )
+                self._state.encode(t_ns, object_id, where, lane, 100 * p, 100 * second_p, *rest)
             )
-            frames.append(self._estimate.encode(t_ns, object_id, x, vx, y, vy))
+            frames.append(self._estimate.encode(t_ns, object_id, *x))
         return frames
 
     def status(self, t_ns: int, values: StatusValues) -> Frame:
         """DetectorStatus."""
         return self._status.encode(t_ns, *values)
-
-
-DIRECTIONS = (0, 1, -1)
-"""Direction of a lane change (+1 left, -1 right) by the value on the bus."""

@@ -29,10 +29,10 @@ class CompiledMessage:
 
 
 class ComponentRule(NamedTuple):
-    """How the raw value at ``index`` becomes state ``state``: ``(raw * scale + offset) * sign +
+    """How the raw value at ``position`` becomes state ``state``: ``(raw * scale + offset) * sign +
     shift`` if ``low <= raw <= high``; ``missing`` stands for "not available"."""
 
-    index: int
+    position: int
     state: int
     scale: float
     offset: float

@@ -33,7 +33,9 @@ LOG_SUFFIXES = tuple(sorted((*_READERS, ".log")))
 _GZ_SUFFIXES = (".asc", ".csv", ".log", ".trc")
 
 _GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.EBADF, errno.ENOTSOCK})
-_FAILURES_TO_GONE = 100
+
+GONE_AFTER_S = 5.0
+"""A bus from which nothing but failures has come for so long is gone."""
 
 
 def log_suffix(path: Path) -> tuple[str, bool]:
@@ -162,7 +164,7 @@ class BusSource:
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
-        self._failures = 0
+        self._failing_since: float | None = None
         self.errors = 0
 
     def recv(self, timeout_s: float) -> Frame | None:
@@ -176,15 +178,17 @@ class BusSource:
         except (can.CanError, OSError, ValueError) as error:
             self._survive(error, timeout_s)
             return None
-        self._failures = 0
+        self._failing_since = None
         return None if message is None else from_message(message)
 
     def _survive(self, error: Exception, timeout_s: float) -> None:
         code = error_code(error)
         self.errors += 1
-        self._failures += 1
+        now = time.monotonic()
+        if self._failing_since is None:
+            self._failing_since = now
         # a link that is down may come up again, no matter how late
-        long = self._failures >= _FAILURES_TO_GONE and code != errno.ENETDOWN
+        long = now - self._failing_since >= GONE_AFTER_S and code != errno.ENETDOWN
         if code in _GONE or long:
             raise BusGone(f"bus {self._bus.channel_info}: {one_line(error)}") from error
         # a failed read returns at once: do not spin

@@ -36,8 +36,8 @@ def truncated_normal(
 ) -> tuple[float, float, float]:  # pragma: no cover - compiled
     """Log mass, mean and variance of a standard normal restricted to [lower, upper].
 
-    Either bound may be infinite.  Below a log mass of `LOG_MASS_FLOOR` the log mass is clipped there
-    and the moments are those of the point of the interval that is nearest to 0.
+    Either bound may be infinite.  Below a log mass of `LOG_MASS_FLOOR` the log mass is clipped
+    there and the moments are those of the point of the interval that is nearest to 0.
     """
     flip = False
     if lower > -np.inf and (upper == np.inf or lower + upper > 0.0):
@@ -45,7 +45,7 @@ def truncated_normal(
     else:
         a, b = -upper, -lower
         flip = True
-    # now the interval lies to the right or covers 0, and a is finite unless both bounds are infinite
+    # Now the interval lies to the right of 0 or covers it; a is finite unless both are infinite.
     if a == -np.inf:
         return 0.0, 0.0, 1.0
     la = log_upper_tail(a)
@@ -53,10 +53,7 @@ def truncated_normal(
     if b < np.inf:
         gap = log_upper_tail(b) - la
         rest = -math.expm1(gap)
-        if rest <= 0.0:
-            log_mass = LOG_MASS_FLOOR
-        else:
-            log_mass = la + math.log(rest)
+        log_mass = LOG_MASS_FLOOR if rest <= 0.0 else la + math.log(rest)
     if not log_mass > LOG_MASS_FLOOR:
         point = max(a, 0.0)
         mean = -point if flip else point
@@ -119,7 +116,7 @@ def truncate_(
 def project_(
     n: int, x: FloatArray, P: FloatArray, i0: int, d: float, floor: float, work: FloatArray
 ) -> bool:  # pragma: no cover - compiled
-    """Project onto the hyperplane x[i0] = d with W = P^-1, in place (equations 24 to 28, corrected).
+    """Project onto the hyperplane x[i0] = d with W = P^-1, in place ((24) to (28), corrected).
 
     x <- x - P D'(D P D')^-1 (D x - d) and P <- (I - G D) P (I - G D)' + floor on state ``i0``.
     Several rows one after the other give the same result as all at once.

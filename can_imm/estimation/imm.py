@@ -17,7 +17,6 @@ from typing import Any
 
 import numba
 import numpy as np
-import numpy.typing as npt
 
 from can_imm.estimation.constraints import project_, truncate_
 from can_imm.estimation.kalman import log_normal, predict_, update_row_, update_state_

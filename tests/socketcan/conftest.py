@@ -42,7 +42,7 @@ class Process:
 
     def _read(self) -> None:
         for line in self.process.stderr:
-            self.said.append(line)  # noqa: PERF402 - line by line, as they come
+            self.said.append(line)
 
     def wait_for(self, text: str, timeout_s: float = 120.0) -> str:
         """Wait until a line with ``text`` was said on standard error and return it."""
