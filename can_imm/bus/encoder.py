@@ -107,17 +107,14 @@ class RadarEncoder:
         """Frames of ``scan``, stamped ``t_ns`` [ns]; components that are not valid are sent as not
         available."""
         n = scan.n
-        columns = (scan.ids[:n], scan.new[:n], np.where(scan.valid[:n], scan.z[:n], np.nan))
-        rows = [
-            row
-            for row in zip(*(c.tolist() for c in columns), strict=True)
-            if row[0] in _SENSOR_OBJECTS
-        ]
+        z = np.where(scan.valid[:n], scan.z[:n], np.nan)
+        objects = zip(scan.ids[:n].tolist(), scan.new[:n].tolist(), z.tolist(), strict=True)
+        rows = [row for row in objects if row[0] in _SENSOR_OBJECTS]
         self.left_out += n - len(rows)
         frames = [self._scan.encode(t_ns, len(rows), self._scans)]
         self._scans = (self._scans + 1) % 65536
-        for object_id, new, z in rows:
-            frames.append(self._object.encode(t_ns, object_id, 1, new, *z))
+        for object_id, new, states in rows:
+            frames.append(self._object.encode(t_ns, object_id, 1, new, *states))
         return frames
 
 

@@ -29,10 +29,11 @@ class QueueWatch:
         except NotImplementedError:
             return
         if fd >= 0 and sys.platform == "linux":
+            own = os.dup(fd)
             try:
-                self._socket = socket.socket(fileno=os.dup(fd))
-            except OSError:
-                return  # a device file
+                self._socket = socket.socket(fileno=own)
+            except OSError:  # a device file
+                os.close(own)
         self._before = self._total()
 
     def drops(self) -> int:

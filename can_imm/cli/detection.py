@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from can_imm.runtime.health import Health
     from can_imm.runtime.nodes import DetectorNode
 
-SLOW_START_S = 1.0
+SLOW_START_S = 3.0
+"""Loading compiled estimators takes less than this [s]."""
 
 
 def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
@@ -129,9 +130,10 @@ def print_summary(
         ("checksums", _join(right=counts.checksums_ok, wrong=counts.bad_crc)),
         ("rejected", _reasons(counts)),
         ("scans", _join(complete=counts.scans - counts.incomplete_scans,
-                        incomplete=counts.incomplete_scans,
-                        dropped=detection.node.dropped_scans)),
-        ("objects", _join(seen=found.births, still_there=detection.node.detector.n_tracked)),
+                        incomplete=counts.incomplete_scans, lost=counts.lost_scans,
+                        late=found.late_scans, dropped=detection.node.dropped_scans)),
+        ("objects", _join(seen=found.births, still_there=detection.node.detector.n_tracked,
+                          outliers=found.outliers, without_a_slot=found.overflow)),
         *more,
     ]  # fmt: skip
     console.print(f"[bold]{escape(title)}[/]")

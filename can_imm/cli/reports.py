@@ -68,7 +68,7 @@ class ReportCsv:
 
 @dataclass
 class LaneChange:
-    """One uninterrupted stretch of LANE_CHANGE of one object."""
+    """A lane change of one object; times are those of the first and last scan that say so [ns]."""
 
     object_id: int
     first_ns: int
@@ -77,25 +77,27 @@ class LaneChange:
 
 
 class LaneChanges:
-    """Collects the lane changes out of the reports."""
+    """Collects the lane changes out of the reports.
+
+    LANE_CHANGE of one object and direction is one lane change also when it is interrupted for up to
+    `GAP_NS`.
+    """
+
+    GAP_NS = 1_000_000_000
 
     def __init__(self) -> None:
         self.found: list[LaneChange] = []
-        self._open: dict[int, LaneChange] = {}
+        self._latest: dict[tuple[int, int], LaneChange] = {}
 
     def __call__(self, t_ns: int, reports: Reports) -> None:
-        seen = set()
         for report in reports:
             if report["manoeuvre"] != Manoeuvre.LANE_CHANGE:
                 continue
-            name = int(report["object_id"])
-            seen.add(name)
-            change = self._open.get(name)
-            if change is None:
-                change = LaneChange(name, int(report["t_ns"]), 0, 0)
-                self._open[name] = change
+            at_ns = int(report["t_ns"])
+            key = int(report["object_id"]), int(report["direction"])
+            change = self._latest.get(key)
+            if change is None or at_ns - change.last_ns > self.GAP_NS:
+                change = LaneChange(key[0], at_ns, at_ns, key[1])
+                self._latest[key] = change
                 self.found.append(change)
-            change.last_ns = int(report["t_ns"])
-            change.direction = int(report["direction"]) or change.direction
-        for name in self._open.keys() - seen:
-            del self._open[name]
+            change.last_ns = at_ns

@@ -18,7 +18,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from can_imm.estimation.constraints import project_, truncate_
+from can_imm.estimation.constraints import project_, truncate_, truncated_normal
 from can_imm.estimation.kalman import log_normal, predict_, update_row_, update_state_
 from can_imm.estimation.particles import (
     N_COLUMNS,
@@ -33,6 +33,9 @@ from can_imm.estimation.particles import (
 from can_imm.types import FloatArray
 
 LOG_FLOOR = -1e30
+
+NEGLIGIBLE = 1e-4
+"""A source less probable than this uses the chain's transition probabilities as they are."""
 
 MAX_ROWS = 4
 """Largest number of constraint rows of one kind in one mode."""
@@ -97,8 +100,8 @@ BANK_DTYPE = np.dtype(
 """Parameters of a mode bank as one record.
 
 Tables are indexed by the number of elapsed steps: ``F[m]``, ``Q[m]``, ``Pi[m]`` belong to m steps;
-``Pi[m, i, j]`` is the probability of going from mode i to mode j.  ``entry_var`` is negative where
-a state is not replaced on entry.
+``Pi[m, i, j]`` is the probability of going from mode i to mode j.  Bit s of ``entry_sources[i, j]``
+says that state s is replaced when j is entered from i; ``entry_var`` is negative where it never is.
 """
 
 OBJECT_DTYPE = np.dtype(
@@ -128,6 +131,8 @@ WORK_DTYPE = np.dtype(
         ("L", np.float64, (4, 4)),
         ("lower", np.float64, (_K,)),
         ("upper", np.float64, (_K,)),
+        ("Pi", np.float64, (_M, _M)),
+        ("var", np.float64, (_N,)),
         ("source", np.int64, (_M,)),
     ],
     align=True,
@@ -139,26 +144,22 @@ WORK_DTYPE = np.dtype(
 def mix_(bank: Any, obj: Any, work: Any, j: int) -> None:  # pragma: no cover - compiled
     """Interaction (15)(16) for target mode j: mixed mean and covariance into work.x[j], work.P[j].
 
-    A source i for which ``entry_sources[i, j]`` holds has its entry states replaced by the mode's
+    Where bit s of ``entry_sources[i, j]`` is set, state s of source i is replaced by the mode's
     entry distribution: what a vehicle that starts this manoeuvre does, not what it did before.
     ``work.w`` holds the mixing weights.
     """
     n_modes, n = bank.n_modes, bank.n_states
     n_sources = 0
-    entering = 0.0
     for i in range(n_modes):
         if work.w[i] > 0.0:
             work.source[n_sources] = i
             n_sources += 1
-            if bank.entry_sources[i, j]:
-                entering += work.w[i]
     for s in range(n):
-        replaced = bank.entry_var[j, s] >= 0.0
         v = 0.0
         for k in range(n_sources):
             i = work.source[k]
             d = obj.x[i, s]
-            if replaced and bank.entry_sources[i, j]:
+            if bank.entry_sources[i, j] >> s & 1:
                 d = bank.entry_mean[j, s]
             work.sx[k, s] = d
             v += work.w[i] * d
@@ -167,18 +168,67 @@ def mix_(bank: Any, obj: Any, work: Any, j: int) -> None:  # pragma: no cover - 
         work.x[j, s] = v
     for s in range(n):
         for t in range(s + 1):
-            replaced = bank.entry_var[j, s] >= 0.0 or bank.entry_var[j, t] >= 0.0
+            replaced = 1 << s | 1 << t
             v = 0.0
             for k in range(n_sources):
                 i = work.source[k]
                 p = work.sx[k, s] * work.sx[k, t]
-                if not (replaced and bank.entry_sources[i, j]):
+                if not bank.entry_sources[i, j] & replaced:
                     p += obj.P[i, s, t]
+                elif s == t:
+                    p += bank.entry_var[j, s]
                 v += work.w[i] * p
-            if replaced and s == t:
-                v += entering * bank.entry_var[j, s]
             work.P[j, s, t] = v
             work.P[j, t, s] = v
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def transitions_(bank: Any, obj: Any, work: Any, m: int) -> None:  # pragma: no cover - compiled
+    """State-dependent transition probabilities of this cycle into work.Pi.
+
+    A bound with ``mass`` is a region outside of which the mode does not exist.  The probability of
+    going from i to j is that of the chain times the mass which source i, moved on by ``m`` steps
+    with its own model, has inside j's regions; each row is normalised again, so that a source
+    loses nothing to a mode it cannot reach.  States that the entry replaces do not count.
+    """
+    n_modes, n = bank.n_modes, bank.n_states
+    for i in range(n_modes):
+        for j in range(n_modes):
+            work.Pi[i, j] = bank.Pi[m, i, j]
+        if obj.mu[i] < NEGLIGIBLE:
+            continue
+        for s in range(n):
+            v = 0.0
+            q = bank.Q[m, i, s, s]
+            for k in range(n):
+                f = bank.F[m, i, s, k]
+                if f != 0.0:
+                    v += f * obj.x[i, k]
+                    for t in range(n):
+                        q += f * bank.F[m, i, s, t] * obj.P[i, k, t]
+            work.tx[s] = v
+            work.var[s] = q
+        total = 0.0
+        for j in range(n_modes):
+            log_mass = 0.0
+            for c in range(bank.n_bounds[j]):
+                s = bank.bound_state[j, c]
+                if not bank.bound_mass[j, c] or (
+                    bank.entry_sources[i, j] >> s & 1
+                ):
+                    continue
+                base = reference(
+                    bank.bound_kind[j, c], bank.bound_lanes[j, c], bank.lane_width, work.tx[s]
+                )
+                sd = math.sqrt(work.var[s])
+                log_mass += truncated_normal(
+                    (base + bank.bound_lower[j, c] - work.tx[s]) / sd,
+                    (base + bank.bound_upper[j, c] - work.tx[s]) / sd,
+                )[0]
+            work.Pi[i, j] *= math.exp(log_mass)
+            total += work.Pi[i, j]
+        for j in range(n_modes):
+            work.Pi[i, j] = work.Pi[i, j] / total if total > 1e-30 else bank.Pi[m, i, j]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -289,11 +339,9 @@ def update_mode_(
             base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], bank.lane_width, x[s])
             work.lower[c] = base + bank.bound_lower[j, c]
             work.upper[c] = base + bank.bound_upper[j, c]
-            mass = truncate_(
+            prior += truncate_(
                 n, work.tx, work.tP, s, work.lower[c], work.upper[c], bank.var_floor, work.row
             )
-            if not bank.bound_mass[j, c]:
-                prior += mass
     log_l += correct_(n, x, P, z, r, valid, age, work.h, work.row)
     posterior = 0.0
     if n_bounds > 0 and bank.is_projected[j]:
@@ -395,19 +443,35 @@ def update_particles_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def combine_(bank: Any, obj: Any) -> None:  # pragma: no cover - compiled
-    """Combined mean and covariance (19)(20) of all modes."""
+def present_(bank: Any, obj: Any, w: FloatArray) -> None:  # pragma: no cover - compiled
+    """Mode probabilities without those at the floor, normalised, into w (M,).
+
+    The floor keeps a mode alive, but its state may be anything: a mode that ends at x = 10 m would
+    widen the covariance of an object at 70 m.
+    """
+    total = 0.0
+    for j in range(bank.n_modes):
+        w[j] = obj.mu[j] if obj.mu[j] > 2.0 * bank.mu_floor else 0.0
+        total += w[j]
+    for j in range(bank.n_modes):
+        w[j] /= total
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def combine_(bank: Any, obj: Any, work: Any) -> None:  # pragma: no cover - compiled
+    """Combined mean and covariance (19)(20) of all modes that are above the floor."""
     n_modes, n = bank.n_modes, bank.n_states
+    present_(bank, obj, work.w)
     for s in range(n):
         v = 0.0
         for j in range(n_modes):
-            v += obj.mu[j] * obj.x[j, s]
+            v += work.w[j] * obj.x[j, s]
         obj.mean[s] = v
     for s in range(n):
         for t in range(s + 1):
             v = 0.0
             for j in range(n_modes):
-                v += obj.mu[j] * (
+                v += work.w[j] * (
                     obj.P[j, s, t] + (obj.x[j, s] - obj.mean[s]) * (obj.x[j, t] - obj.mean[t])
                 )
             obj.cov[s, t] = v
@@ -501,17 +565,25 @@ def cycle_(
     n_modes, n = bank.n_modes, bank.n_states
     if surprise(bank, obj, m, z, r, valid, age) > gate:
         return OUTLIER
+    transitions_(bank, obj, work, m)
     for j in range(n_modes):
-        s = 0.0
+        c = 0.0
         for i in range(n_modes):
-            s += bank.Pi[m, i, j] * obj.mu[i]
-        work.c[j] = s
+            c += work.Pi[i, j] * obj.mu[i]
+        work.c[j] = c
     for j in range(n_modes):
+        # A mode at the floor is not there: its state may be anything, so it is no source.
+        total = 0.0
         for i in range(n_modes):
-            w = bank.Pi[m, i, j] * obj.mu[i] / work.c[j] if work.c[j] > 0.0 else 0.0
-            work.w[i] = w if w > 1e-12 else 0.0
+            w = work.Pi[i, j] * obj.mu[i]
+            if w <= 1e-12 * work.c[j] or (i != j and obj.mu[i] <= 2.0 * bank.mu_floor):
+                w = 0.0
+            work.w[i] = w
+            total += w
+        for i in range(n_modes):
+            work.w[i] = work.w[i] / total if total > 0.0 else 0.0
         log_l = LOG_FLOOR
-        if work.c[j] <= 0.0:
+        if not total > 0.0:
             keep_combined_(n, obj, work.x[j], work.P[j])
         elif bank.is_particle[j]:
             log_l = update_particles_(
@@ -529,7 +601,7 @@ def cycle_(
             obj.x[j, s] = work.x[j, s]
             for t in range(n):
                 obj.P[j, s, t] = work.P[j, s, t]
-    combine_(bank, obj)
+    combine_(bank, obj, work)
     return OK
 
 
@@ -570,7 +642,7 @@ def birth_(
             obj.x[j, s] = work.x[j, s]
             for t in range(n):
                 obj.P[j, s, t] = work.P[j, s, t]
-    combine_(bank, obj)
+    combine_(bank, obj, work)
     return OK
 
 
@@ -584,6 +656,7 @@ def extrapolate_(
     with Pi(m).  Writes x (n,), P (n, n), mu (n_modes,).
     """
     n_modes, n = bank.n_modes, bank.n_states
+    present_(bank, obj, work.c)
     for s in range(n):
         x[s] = 0.0
         for t in range(n):
@@ -599,11 +672,11 @@ def extrapolate_(
                 work.P[j, s, t] = obj.P[j, s, t]
         predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
         for s in range(n):
-            x[s] += obj.mu[j] * work.x[j, s]
+            x[s] += work.c[j] * work.x[j, s]
     for j in range(n_modes):
         for s in range(n):
             for t in range(n):
-                P[s, t] += obj.mu[j] * (
+                P[s, t] += work.c[j] * (
                     work.P[j, s, t] + (work.x[j, s] - x[s]) * (work.x[j, t] - x[t])
                 )
 

@@ -249,12 +249,12 @@ def _fill_constraints(
         s = _state(row, states)
         record["entry_mean"][j, s] = row.number("mean")
         record["entry_var"][j, s] = row.number("std", low=0.0) ** 2
+        for source in row.take("from", list, names):
+            if source not in names:
+                raise row.error(f"'from' names the unknown mode '{source}'")
+            if source != names[j]:
+                record["entry_sources"][names.index(source), j] |= 1 << s
         row.done()
-    sources = mode.take("entry_from", list, names)
-    for source in sources:
-        if source not in names:
-            raise mode.error(f"'entry_from' names the unknown mode '{source}'")
-        record["entry_sources"][names.index(source), j] = source != names[j]
 
 
 def _fill_particle(record: Any, table: _Table) -> int:

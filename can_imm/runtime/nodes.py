@@ -129,10 +129,14 @@ class DetectorNode:
             state = DetectorState.NO_SENSOR
         else:
             state = DetectorState.RUNNING
+        counts = self.decoder.counts
         return StatusValues(
             state=state,
             objects_tracked=self.detector.n_tracked,
             deadline_misses=self._health.deadline_misses,
-            frames_rejected=self.decoder.counts.rejected,
-            dropped_scans=self.dropped_scans + self.decoder.counts.incomplete_scans,
+            frames_rejected=counts.rejected,
+            dropped_scans=self.dropped_scans
+            + counts.incomplete_scans
+            + counts.lost_scans
+            + self.detector.counts.late_scans,
         )

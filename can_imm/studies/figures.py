@@ -10,8 +10,8 @@ import numpy as np
 from can_imm import plots
 from can_imm.studies.metrics import summarise
 from can_imm.studies.paper import TABLE_6, Result
-from can_imm.studies.runs import play
-from can_imm.studies.systems import answer
+from can_imm.studies.runs import Observation, play
+from can_imm.studies.systems import Answer, answer
 
 PROFILE = np.array([(50.0, 0.0), (51.1, 2.1), (52.6, 2.1), (53.75, 0.0)])
 """Corners (gap [m], relative speed [m/s]) of the paper's f(x), Fig. 4."""
@@ -22,8 +22,15 @@ def one_run(directory: Path, system: str, truth: str, seed: int) -> list[Path]:
     scans, observations = play(truth, seed)
     seen = observations[0]
     said = answer(system, scans, observations, seed)[0]
-    if said.manoeuvre is None or said.p is None:
+    if said.p is None:
         raise ValueError(f"{system} gives no probabilities to draw")
+    return paper_figures(directory, seen, said)
+
+
+def paper_figures(directory: Path, seen: Observation, said: Answer) -> list[Path]:
+    """Figures 3 to 8 of what a system with probabilities says of one object."""
+    assert said.manoeuvre is not None
+    assert said.p is not None
     true = seen.truth
     run = plots.Run(
         truth_t_s=np.multiply(true.t_ns, 1e-9),

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -64,33 +65,55 @@ def _baseline(system: str, seen: Observation) -> Answer:
     return Answer(apply_rules(x, RULES) if system == "rules" else None, None, x, cov)
 
 
+class Collector:
+    """What a detector says of the observed objects: takes reports, scan by scan.
+
+    It can stand among the listeners of a `runtime.nodes.DetectorNode`.
+
+    Attributes:
+        answers: one per observation, in their order; rows not yet reported are UNKNOWN with NaN.
+
+    Args:
+        observations: the objects.
+        start_ns: the reports' time at which the observations' time 0 lies [ns].
+    """
+
+    def __init__(self, observations: Sequence[Observation], start_ns: int = 0) -> None:
+        self.answers: list[Answer] = []
+        self._row: dict[tuple[int, int], tuple[Answer, int]] = {}
+        for one in observations:
+            n = len(one.t_ns)
+            said = Answer(
+                np.zeros(n, np.int8),
+                np.zeros((n, N_MANOEUVRES)),
+                np.full((n, 4), np.nan),
+                np.full((n, 4, 4), np.nan),
+            )
+            self.answers.append(said)
+            for k, t_ns in enumerate(one.t_ns):
+                self._row[one.truth.object_id, int(t_ns) + start_ns] = said, k
+
+    def __call__(self, t_ns: int, reports: npt.NDArray[Any]) -> None:
+        for report in reports:
+            found = self._row.get((int(report["object_id"]), int(report["t_ns"])))
+            if found is None:
+                continue
+            said, k = found
+            assert said.manoeuvre is not None
+            assert said.p is not None
+            said.manoeuvre[k] = report["manoeuvre"]
+            said.p[k] = report["p"]
+            said.x[k] = report["x"]
+            said.cov[k] = report["cov"]
+
+
 def _detect(
     modes: ModeBank, scans: Sequence[Scan], observations: Sequence[Observation], seed: int
 ) -> list[Answer]:
     detector = Detector(modes, capacity=len(observations), seed=seed)
-    answers: dict[int, Answer] = {}
-    row: dict[tuple[int, int], int] = {}
-    for one in observations:
-        n, object_id = len(one.t_ns), one.truth.object_id
-        answers[object_id] = Answer(
-            np.zeros(n, np.int8),
-            np.zeros((n, N_MANOEUVRES)),
-            np.full((n, 4), np.nan),
-            np.full((n, 4, 4), np.nan),
-        )
-        row.update({(object_id, int(t)): k for k, t in enumerate(one.t_ns)})
+    collect = Collector(observations)
     due = {scan.t_ns: scan for scan in scans}
     for t_ns in range(0, max(due) + 1, modes.step_ns):
         n = detector.step(t_ns, due.get(t_ns))
-        for report in detector.reports[:n]:
-            object_id = int(report["object_id"])
-            k = row.get((object_id, int(report["t_ns"])))
-            if k is not None:
-                said = answers[object_id]
-                assert said.manoeuvre is not None
-                assert said.p is not None
-                said.manoeuvre[k] = report["manoeuvre"]
-                said.p[k] = report["p"]
-                said.x[k] = report["x"]
-                said.cov[k] = report["cov"]
-    return [answers[one.truth.object_id] for one in observations]
+        collect(t_ns, detector.reports[:n])
+    return collect.answers

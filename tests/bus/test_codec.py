@@ -66,6 +66,14 @@ def test_raw_is_the_nearest_step_within_the_range(own_db, value):
         assert raw == 16383
 
 
+def test_ranges_are_those_of_the_dbc_to_the_step():
+    for message in MESSAGES:
+        for signal in message.signals:
+            scaling = field(signal)
+            ends = [raw * signal.scale + signal.offset for raw in (scaling.low, scaling.high)]
+            assert ends == pytest.approx([signal.minimum, signal.maximum], abs=1e-9), signal.name
+
+
 def test_raw_without_a_code_for_it_takes_the_end_of_the_range(own_db):
     scaling = field(own_db.get_message_by_name("DetectorStatus").get_signal_by_name("DroppedScans"))
     assert (scaling.raw(5000), scaling.raw(-3), scaling.raw(float("nan"))) == (4095, 0, 0)

@@ -72,6 +72,19 @@ def test_a_whole_scan_in_si_units(bench, radar):
     assert bench.decoder.ids == {0x300, 0x301}
 
 
+def test_latency_sign_and_offset_of_a_profile(tmp_path, radar):
+    text = PROFILE.path.read_text().replace("latency_ms = 0", "latency_ms = 12.5")
+    text = text.replace("std = 0.2", "std = 0.4, sign = -1, offset = 0.5")
+    text = text.replace('dbc = "', f'dbc = "{PROFILE.path.parent}/')
+    (tmp_path / "x.toml").write_text(text)
+    decoder = ScanDecoder(load_profile(str(tmp_path / "x.toml")))
+    decoder.feed(Frame(100 * MS, *radar.scan(1)))
+    scan = decoder.feed(Frame(101 * MS, *radar.object(1, DistLat=2.0)))
+    assert scan.t_ns == 87_500_000
+    assert scan.z[0, 2] == pytest.approx(-1.5)
+    assert scan.std[0].tolist() == [0.1, 0.3, 0.4, 0.3]
+
+
 def test_an_empty_scan_is_a_scan(bench, radar):
     bench.feed(radar.scan(0))
     assert bench.scans == [(0, [], False)]

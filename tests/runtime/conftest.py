@@ -18,8 +18,7 @@ from can_imm.types import REPORT_DTYPE, Scan
 
 @dataclass
 class Counts:
-    births: int = 0
-    deaths: int = 0
+    late_scans: int = 0
 
 
 class HashDetector:

@@ -11,15 +11,18 @@ import can
 import numpy as np
 import pytest
 
-from can_imm.bus.encoder import OUTPUT_IDS, STATUS_ID, RadarEncoder
+from can_imm.bus.decoder import ScanDecoder
+from can_imm.bus.encoder import OUTPUT_IDS, STATUS_ID, ManoeuvreEncoder, RadarEncoder
 from can_imm.bus.frame import Frame
 from can_imm.bus.sinks import BusSink, LogSink
 from can_imm.bus.sources import BusSource, LogSource
+from can_imm.detector import Detector
+from can_imm.manoeuvres import load_bank
 from can_imm.runtime.clock import FastClock, WallClock
 from can_imm.runtime.feeds import BusFeed, IdleFeed, LogFeed
 from can_imm.runtime.health import Health
 from can_imm.runtime.loop import STEP_NS, Loop, run
-from can_imm.runtime.nodes import SenderNode
+from can_imm.runtime.nodes import DetectorNode, SenderNode
 from can_imm.sim.player import Player
 from can_imm.types import Scan
 
@@ -172,3 +175,19 @@ def test_a_shift_by_one_step_would_be_noticed(bus_pair, make_node, tmp_path):
     moved = f"({float(stamp) + 0.00001:.6f})" + lines[k][len(stamp) + 2 :]
     path.write_text("".join([*lines[:k], moved, *lines[k + 1 :]]))
     assert replayed(path, make_node) != manoeuvres(keep.frames)
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf"])
+def test_the_real_detector_repeats_itself(bus_pair, tmp_path, suffix, profile):
+    bank = load_bank("two-lane")
+
+    def make_node(health: Health) -> DetectorNode:
+        return DetectorNode(ScanDecoder(profile), Detector(bank), ManoeuvreEncoder(), health)
+
+    path = tmp_path / f"run{suffix}"
+    keep = Keep()
+    with LogSink(path) as log:
+        fast_run(bus_pair, make_node, keep, log)
+    live = manoeuvres(keep.frames)
+    assert len(live) > 300
+    assert replayed(path, make_node) == live

@@ -1,0 +1,173 @@
+"""``can-imm replay``: what it writes, what it says, what it refuses."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import time
+
+import pytest
+
+from can_imm.bus.encoder import OUTPUT_IDS
+from can_imm.bus.sinks import LogSink
+from can_imm.bus.sources import LogSource
+
+COLUMNS = (
+    "time_s,object_id,manoeuvre,probability,lane,direction,x,vx,y,vy,p_keep_right,p_lane_change,"
+    "p_keep_left,p_overtaking,p_receding,p_approaching,p_rear_end"
+)
+
+
+def rows_of(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def test_csv_has_a_row_per_object_and_scan(can_imm, log, tmp_path):
+    path = tmp_path / "reports.csv"
+    status, _, _ = can_imm("replay", log, "--csv", path)
+    assert status == 0
+    text = path.read_text()
+    assert text.splitlines()[0] == COLUMNS
+    rows = rows_of(text)
+    assert [row["time_s"] for row in rows] == [f"{k // 10}.{k % 10}00000" for k in range(61)]
+    assert {row["object_id"] for row in rows} == {"3"}
+    said = [row["manoeuvre"] for row in rows]
+    assert said[15] == "KEEP_RIGHT"
+    assert said[30] == "LANE_CHANGE"
+    assert rows[30]["direction"] == "left"
+    assert said[58] == "KEEP_LEFT"
+    assert rows[15]["lane"] == "0"
+    assert rows[58]["lane"] == "1"
+    for row in rows[5:]:
+        chances = {key: float(value) for key, value in row.items() if key.startswith("p_")}
+        assert sum(chances.values()) == pytest.approx(1, abs=1e-3)
+        assert chances[f"p_{row['manoeuvre'].lower()}"] == pytest.approx(
+            float(row["probability"]), abs=1e-3
+        )
+    assert float(rows[58]["x"]) == pytest.approx(40, abs=0.5)
+    assert float(rows[58]["y"]) == pytest.approx(3, abs=0.3)
+
+
+def test_csv_on_standard_output_leaves_the_summary_to_standard_error(can_imm, log):
+    status, out, err = can_imm("replay", log, "--csv", "-")
+    assert status == 0
+    assert len(rows_of(out)) == 61
+    assert "122 read" in err
+
+
+def test_summary(can_imm, log):
+    status, out, err = can_imm("replay", log)
+    assert status == 0
+    assert err == ""
+    lines = {line.split()[0]: line for line in out.splitlines() if line.startswith("  ")}
+    assert "122 read, 122 used" in lines["frames"]
+    assert "122 right, 0 wrong" in lines["checksums"]
+    assert lines["rejected"].split() == ["rejected", "0"]
+    assert "61 complete, 0 incomplete" in lines["scans"]
+    assert "1 seen" in lines["objects"]
+    assert "0 bad" in lines["lines"]
+    changes = re.findall(r"^ +([\d.]+) +([\d.]+) +3  left$", out, re.MULTILINE)
+    assert len(changes) == 1
+    assert 2.0 <= float(changes[0][0]) <= 3.0
+    assert 3.0 <= float(changes[0][1]) <= 4.6
+
+
+def test_broken_input_is_counted_and_survived(can_imm, log, tmp_path):
+    lines = log.read_text().splitlines(keepends=True)
+    assert " 301#" in lines[41]
+    lines[41] = lines[41].replace("#", "#F", 1)[: len(lines[41]) - 1] + "\n"
+    lines[50:50] = [
+        "DROPCOUNT: dropped 12 CAN frames on 'can0' socket\n",
+        "garbage\n",
+        "(1.5) can0 3\n",
+    ]
+    lines.append("(6.050000) can0 7FF#00\n")
+    path = tmp_path / "broken.log"
+    path.write_text("".join(lines))
+    status, out, _ = can_imm("replay", path)
+    assert status == 0
+    assert "1 wrong" in out
+    assert "1 (1 wrong checksum)" in out
+    assert "60 complete, 1 incomplete" in out
+    assert "2 bad, 12 frames lost" in out
+    assert "1 unknown" in out
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".blf", ".csv.gz"])
+def test_out_merges_input_and_answers_in_any_format(can_imm, log, tmp_path, suffix):
+    out = tmp_path / f"merged{suffix}"
+    status, _, _ = can_imm("replay", log, "--out", out)
+    assert status == 0
+    with LogSource(log) as source:
+        received = [(f.t_ns, f.id, f.data) for f in source]
+    with LogSource(out) as source:
+        merged = [(f.t_ns, f.id, f.data) for f in source]
+    first = merged[0][0]
+    assert [(t - first, i, d) for t, i, d in merged if i not in OUTPUT_IDS] == received
+    assert sum(i == 0x310 for _, i, _ in merged) == 61
+    assert [t for t, _, _ in merged] == sorted(t for t, _, _ in merged)
+
+
+def test_answers_of_an_earlier_detector_are_replaced(can_imm, log, tmp_path):
+    first, second = tmp_path / "first.log", tmp_path / "second.log"
+    can_imm("replay", log, "--out", first)
+    status, out, _ = can_imm("replay", first, "--out", second)
+    assert status == 0
+    assert second.read_bytes() == first.read_bytes()
+    assert f"{2 * 61 + 61:,} manoeuvre frames of an earlier detector" in out
+
+
+def test_realtime_takes_as_long_as_the_log(can_imm, log, tmp_path):
+    short = tmp_path / "short.log"
+    short.write_text("".join(log.read_text().splitlines(keepends=True)[:20]))  # 0.9 s
+    can_imm("replay", short)
+    began = time.monotonic()
+    status, _, _ = can_imm("replay", short, "--realtime")
+    assert status == 0
+    assert time.monotonic() - began >= 0.9
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["missing.log"], "missing.log"),
+        (["{log}.xyz"], ".xyz"),
+        (["{log}", "--profile", "nope"], "nope"),
+        (["{log}", "--profile", "nope.toml"], "nope.toml"),
+        (["{log}", "--preset", "nope"], "nope"),
+        (["{log}", "--csv", "/no/such/dir/x.csv"], "/no/such/dir/x.csv"),
+        (["{log}", "--out", "/no/such/dir/x.log"], "/no/such/dir/x.log"),
+        (["{log}", "--out", "x.nope"], "x.nope"),
+        (["{log}", "--out", "{log}"], "this is the log that is read"),
+    ],
+)
+def test_refusals_are_one_line(can_imm, log, arguments, named):
+    status, out, err = can_imm("replay", *(a.format(log=log) for a in arguments))
+    assert status == 1
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("can-imm: error: ")
+    assert named in err
+
+
+def test_an_empty_log_is_refused(can_imm, tmp_path):
+    path = tmp_path / "empty.log"
+    path.write_text("")
+    status, _, err = can_imm("replay", path)
+    assert status == 1
+    assert err.count("\n") == 1
+    assert "empty.log" in err
+
+
+def test_a_truncated_log_gives_what_it_holds(can_imm, log, tmp_path):
+    whole, cut = tmp_path / "whole.blf", tmp_path / "cut.blf"
+    with LogSource(log) as source, LogSink(whole) as sink:
+        for frame in source:
+            sink.send(frame)
+    data = whole.read_bytes()
+    cut.write_bytes(data[: len(data) - 40])
+    status, out, err = can_imm("replay", cut)
+    assert status in (0, 1)
+    assert "Traceback" not in err
+    assert ("cut.blf" in out) or ("cut.blf" in err)
