@@ -613,7 +613,7 @@ def birth_(
 
     Every mode starts from a prior as wide as traffic gets, centred on the measured position and on
     zero speed, with its entry distribution and its constraints applied; so the first probabilities
-    are honest ones.
+    are honest ones.  Regions count with the mass that the measurement alone gives them.
     """
     n_modes, n = bank.n_modes, bank.n_states
     for j in range(n_modes):
@@ -630,6 +630,19 @@ def birth_(
                 x[s] = bank.entry_mean[j, s]
                 P[s, s] = bank.entry_var[j, s]
         work.c[j] = bank.mu0[j]
+        for c in range(bank.n_bounds[j]):
+            s = bank.bound_state[j, c]
+            if bank.bound_mass[j, c] and s < 4 and valid[s]:
+                base = reference(
+                    bank.bound_kind[j, c], bank.bound_lanes[j, c], bank.lane_width, z[s]
+                )
+                sd = math.sqrt(r[s])
+                work.c[j] *= math.exp(
+                    truncated_normal(
+                        (base + bank.bound_lower[j, c] - z[s]) / sd,
+                        (base + bank.bound_upper[j, c] - z[s]) / sd,
+                    )[0]
+                )
         log_l = update_mode_(bank, work, j, z, r, valid, age)
         if bank.is_particle[j]:
             log_l = LOG_FLOOR  # entered from another mode, never born into

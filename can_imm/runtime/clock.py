@@ -58,24 +58,19 @@ class WallClock:
 
 
 class PacedClock:
-    """Real time, from the first moment that is asked for: to watch a log at the speed of life, or
-    at ``rate`` times that speed."""
+    """Real time, from the first moment that is asked for: to watch a log at the speed of life."""
 
-    def __init__(self, rate: float = 1.0) -> None:
+    def __init__(self) -> None:
         self.jumps = 0
-        self._rate = rate
         self._shift_ns: int | None = None
 
     def now_ns(self) -> int:
-        return self._running_ns() + (self._shift_ns or 0)
+        return steady_ns() + (self._shift_ns or 0)
 
     def remaining_s(self, t_ns: int) -> float:
         if self._shift_ns is None:
-            self._shift_ns = t_ns - self._running_ns()
-        return (t_ns - self.now_ns()) * 1e-9 / self._rate
-
-    def _running_ns(self) -> int:
-        return int(steady_ns() * self._rate)
+            self._shift_ns = t_ns - steady_ns()
+        return (t_ns - self.now_ns()) * 1e-9
 
 
 class FastClock:

@@ -34,8 +34,8 @@ class Neighbour:
         self._bus.shutdown()
 
     def _run(self) -> None:
-        # the first heartbeat says that the detector listens
-        first = self._bus.recv(60.0)
+        # the first heartbeat says that the detector listens; before it may have to compile
+        first = self._bus.recv(300.0)
         assert first is not None
         self.heard.append(first)
         encoder = RadarEncoder()

@@ -75,12 +75,3 @@ def test_paced_clock_starts_at_the_first_moment_asked_for(machine):
     machine.pass_ns(4 * MS)
     assert clock.now_ns() == 46 * MS
     assert clock.remaining_s(52 * MS) == pytest.approx(0.006)
-
-
-def test_paced_clock_runs_at_its_rate(machine):
-    clock = PacedClock(rate=4.0)
-    assert clock.remaining_s(40 * MS) <= 0
-    assert clock.remaining_s(48 * MS) == pytest.approx(0.002)
-    machine.pass_ns(1 * MS)
-    assert clock.now_ns() == 44 * MS
-    assert clock.remaining_s(48 * MS) == pytest.approx(0.001)

@@ -1,0 +1,138 @@
+"""The demonstration in plain lines, and its summary."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from can_imm.bus.encoder import OUTPUT_IDS
+from can_imm.cli.demo_bands import bands
+from can_imm.studies.metrics import evaluate, summarise
+from can_imm.studies.paper import TABLE_6, score
+from can_imm.studies.systems import answer
+from can_imm.types import Manoeuvre
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rich.console import Console
+
+    from can_imm.cli.demo_run import DemoRun, Track
+
+COLUMNS = {
+    "accu-\nracy": ("accuracy", 4),
+    "\n±0.5s": ("accuracy_tol_0_5", 4),
+    "macro\nF1": ("macro_f1", 3),
+    "delay\ns": ("mean_delay_s", 2),
+    "swit-\nches": ("switches", 0),
+    "x\nm": ("rmse_x", 4),
+    "vx\nm/s": ("rmse_vx", 4),
+    "y\nm": ("rmse_y", 4),
+    "vy\nm/s": ("rmse_vy", 4),
+}
+"""Column of the summary -> metric and decimals."""
+
+
+class PlainLines:
+    """Prints a line for each change of what is true or said; call it after each scan."""
+
+    def __init__(self, show: DemoRun, title: str) -> None:
+        self._show = show
+        self._last: dict[int, tuple[int, int]] = {}
+        print(f"can-imm demo: {title}", flush=True)
+        print("    time     gap  object  true          said          probability", flush=True)
+
+    def __call__(self) -> None:
+        at_ns = self._show.at_ns
+        for track in self._show.tracks:
+            k = track.rows(at_ns) - 1
+            if k < 0 or track.t_ns[k] != at_ns:
+                continue
+            labels = int(track.label[k]), int(track.manoeuvre[k])
+            if self._last.get(track.object_id) != labels:
+                self._last[track.object_id] = labels
+                print(_line(track, k), flush=True)
+
+
+def _line(track: Track, k: int) -> str:
+    true, said = Manoeuvre(track.label[k]), Manoeuvre(track.manoeuvre[k])
+    return (
+        f"{track.t_ns[k] * 1e-9:7.1f}s {track.x[k, 0]:6.2f}m {track.object_id:7}  "
+        f"{true.name:12}  {said.name:12}  {track.p[k, said]:11.3f}"
+        f"{'' if true == said else '  wrong'}"
+    )
+
+
+def print_summary(show: DemoRun, console: Console, title: str, preset: str) -> None:
+    """Print how the run went so far, the preset beside the baselines and the paper's Table 6."""
+    seen, said = show.so_far()
+    scans = [scan for scan in show.scans if scan.t_ns <= show.at_ns]
+    rows: dict[str, Mapping[str, tuple[float, float]]] = {
+        preset: summarise([score(*pair) for pair in zip(seen, said, strict=True)])
+    }
+    for system in ("rules", "kalman", "measurement"):
+        answers = answer(system, scans, seen, 0)
+        rows[system] = summarise([score(*pair) for pair in zip(seen, answers, strict=True)])
+    rows["paper, Table 6"] = {f"rmse_{state}": (rmse, 0.0) for state, rmse in TABLE_6.items()}
+    truth = summarise(
+        [evaluate(one.t_ns, one.label, one.state, one.label, None, None, None) for one in seen]
+    )
+
+    console.print()
+    console.print(
+        f"[bold]can-imm demo[/]  {escape(title)}: {show.at_ns * 1e-9:.1f} s, "
+        f"{len(scans)} scans" + (f", mean over {len(seen)} objects" if len(seen) > 1 else "")
+    )
+    if console.is_terminal:
+        console.print()
+        for line in bands(show.tracks[0], show.at_ns, show.duration_ns, console.width):
+            console.print(line)
+    console.print()
+    console.print(_table(rows))
+    console.print()
+    console.print(_bus_lines(show, truth["switches"][0]))
+    console.print(
+        "One run is one run: 'can-imm study paper' gives means and standard errors over many."
+    )
+
+
+def _table(rows: Mapping[str, Mapping[str, tuple[float, float]]]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, collapse_padding=True)
+    table.add_column("\nsystem", no_wrap=True)
+    for column in COLUMNS:
+        table.add_column(column, justify="right", no_wrap=True)
+    for number, (system, values) in enumerate(rows.items()):
+        cells = [_cell(values.get(name), digits) for name, digits in COLUMNS.values()]
+        table.add_row(escape(system), *cells, style="bold" if number == 0 else None)
+    return table
+
+
+def _cell(value: tuple[float, float] | None, digits: int) -> str:
+    return f"{value[0]:.{digits}f}" if value is not None and np.isfinite(value[0]) else "-"
+
+
+def _bus_lines(show: DemoRun, switches: float) -> Text:
+    counts, decoded = show.tap.counts, show.node.decoder.counts
+    answers = sum(counts[i] for i in OUTPUT_IDS)
+    lines: list[tuple[str, Any]] = [
+        ("switches", f"{switches:.0f} true, beside those said in the table"),
+        (
+            "bus",
+            f"{decoded.frames:,} radar frames, {decoded.rejected:,} rejected; "
+            f"{answers:,} frames of the detector, {show.tap.rejected:,} rejected",
+        ),
+        (
+            "loop",
+            f"{show.health.steps:,} steps of 10 ms, {show.health.late_frames:,} late frames; "
+            f"a scan takes {show.work.quantile_ns(0.5) / 1e6:.2f} ms",
+        ),
+    ]
+    text = Text()
+    for name, what in lines:
+        text.append(f"{name:<10}", "dim").append(f"{what}\n")
+    return text
