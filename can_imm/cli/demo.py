@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from can_imm.cli.demo_run import DemoRun
 
-WATCH_S = 10.0
+WATCH_S = 9.0
 """How long an accelerated run takes on a terminal, unless that is slower than real time."""
 
 PLAIN_WIDTH = 80

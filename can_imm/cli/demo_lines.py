@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich import box
@@ -24,16 +24,17 @@ if TYPE_CHECKING:
 
     from can_imm.cli.demo_run import DemoRun, Track
 
+SWITCHES = "switches\n{:g} true"
 COLUMNS = {
     "accu-\nracy": ("accuracy", 4),
     "\n±0.5s": ("accuracy_tol_0_5", 4),
     "macro\nF1": ("macro_f1", 3),
-    "delay\ns": ("mean_delay_s", 2),
-    "swit-\nches": ("switches", 0),
-    "x\nm": ("rmse_x", 4),
-    "vx\nm/s": ("rmse_vx", 4),
-    "y\nm": ("rmse_y", 4),
-    "vy\nm/s": ("rmse_vy", 4),
+    "delay\n[s]": ("mean_delay_s", 2),
+    SWITCHES: ("switches", 0),
+    "x\n[m]": ("rmse_x", 4),
+    "vx\n[m/s]": ("rmse_vx", 4),
+    "y\n[m]": ("rmse_y", 4),
+    "vy\n[m/s]": ("rmse_vy", 4),
 }
 """Column of the summary -> metric and decimals."""
 
@@ -83,29 +84,25 @@ def print_summary(show: DemoRun, console: Console, title: str, preset: str) -> N
         [evaluate(one.t_ns, one.label, one.state, one.label, None, None, None) for one in seen]
     )
 
-    console.print()
-    console.print(
-        f"[bold]can-imm demo[/]  {escape(title)}: {show.at_ns * 1e-9:.1f} s, "
-        f"{len(scans)} scans" + (f", mean over {len(seen)} objects" if len(seen) > 1 else "")
-    )
+    objects = f", mean over {len(seen)} objects" if len(seen) > 1 else ""
+    console.print(f"[bold]can-imm demo[/]  {escape(title)}")
+    console.print(f"{show.at_ns * 1e-9:.1f} s, {len(scans)} scans{objects}")
     if console.is_terminal:
         console.print()
         for line in bands(show.tracks[0], show.at_ns, show.duration_ns, console.width):
             console.print(line)
     console.print()
-    console.print(_table(rows))
+    console.print(_table(rows, truth["switches"][0]))
     console.print()
-    console.print(_bus_lines(show, truth["switches"][0]))
-    console.print(
-        "One run is one run: 'can-imm study paper' gives means and standard errors over many."
-    )
+    console.print(_bus_lines(show))
+    console.print("One run is one run: 'can-imm study paper' has the statistics of many.")
 
 
-def _table(rows: Mapping[str, Mapping[str, tuple[float, float]]]) -> Table:
+def _table(rows: Mapping[str, Mapping[str, tuple[float, float]]], switches: float) -> Table:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, collapse_padding=True)
     table.add_column("\nsystem", no_wrap=True)
     for column in COLUMNS:
-        table.add_column(column, justify="right", no_wrap=True)
+        table.add_column(escape(column.format(switches)), justify="right", no_wrap=True)
     for number, (system, values) in enumerate(rows.items()):
         cells = [_cell(values.get(name), digits) for name, digits in COLUMNS.values()]
         table.add_row(escape(system), *cells, style="bold" if number == 0 else None)
@@ -113,26 +110,22 @@ def _table(rows: Mapping[str, Mapping[str, tuple[float, float]]]) -> Table:
 
 
 def _cell(value: tuple[float, float] | None, digits: int) -> str:
-    return f"{value[0]:.{digits}f}" if value is not None and np.isfinite(value[0]) else "-"
+    if value is None or not np.isfinite(value[0]):
+        return "-"
+    text = f"{value[0]:.{digits}f}"
+    return text.removeprefix("0") if digits else text
 
 
-def _bus_lines(show: DemoRun, switches: float) -> Text:
+def _bus_lines(show: DemoRun) -> Text:
     counts, decoded = show.tap.counts, show.node.decoder.counts
     answers = sum(counts[i] for i in OUTPUT_IDS)
-    lines: list[tuple[str, Any]] = [
-        ("switches", f"{switches:.0f} true, beside those said in the table"),
-        (
-            "bus",
-            f"{decoded.frames:,} radar frames, {decoded.rejected:,} rejected; "
-            f"{answers:,} frames of the detector, {show.tap.rejected:,} rejected",
-        ),
-        (
-            "loop",
-            f"{show.health.steps:,} steps of 10 ms, {show.health.late_frames:,} late frames; "
-            f"a scan takes {show.work.quantile_ns(0.5) / 1e6:.2f} ms",
-        ),
-    ]
+    lines = {
+        "radar": f"{decoded.frames:,} frames, {decoded.rejected:,} rejected",
+        "detector": f"{answers:,} frames, {show.tap.rejected:,} rejected",
+        "loop": f"{show.health.steps:,} steps of 10 ms, {show.health.late_frames:,} late frames; "
+        f"answers: half within {show.work.quantile_ns(0.5) / 1e6:.2f} ms",
+    }
     text = Text()
-    for name, what in lines:
+    for name, what in lines.items():
         text.append(f"{name:<10}", "dim").append(f"{what}\n")
     return text

@@ -58,6 +58,9 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         bus = stack.enter_context(open_bus_from(args))
         source, sink = BusSource(bus), BusSink(bus)
+        log = LogSink(args.log) if args.log else None
+        if log is not None:
+            stack.callback(log.close)
         detection = build(args)
         stack.callback(detection.close)
         health = detection.health
@@ -67,9 +70,6 @@ def run(args: argparse.Namespace) -> int:
         queue = QueueWatch(bus)
         stack.callback(queue.close)
         own = EchoFilter(source, sink, health)
-        log = LogSink(args.log) if args.log else None
-        if log is not None:
-            stack.callback(log.close)
         clock = WallClock()
         feed = BusFeed(own, clock, health)
         loop = Loop(feed, detection.node, health, [own], [log] if log else [])

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
-import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from can_imm.cli.compiling import announced
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from can_imm.cli.reports import LaneChanges, ReportCsv
     from can_imm.runtime.health import Health
     from can_imm.runtime.nodes import DetectorNode
-
-SLOW_START_S = 3.0
-"""Loading compiled estimators takes less than this [s]."""
 
 
 def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,14 +73,7 @@ def build(args: argparse.Namespace) -> Detection:
         CanImmError: a profile, DBC or preset is missing or wrong.
         OSError: the CSV file cannot be written.
     """
-    # Said only when it takes long: numba keeps what it compiled for the next start.
-    notice = threading.Timer(
-        SLOW_START_S, print, ["can-imm: compiling the estimators (once, up to a minute) ..."],
-        {"file": sys.stderr, "flush": True},
-    )  # fmt: skip
-    notice.daemon = True
-    notice.start()
-    try:
+    with announced():
         from can_imm.bus.decoder import ScanDecoder
         from can_imm.bus.encoder import ManoeuvreEncoder
         from can_imm.bus.profile import load_profile
@@ -94,16 +84,16 @@ def build(args: argparse.Namespace) -> Detection:
         from can_imm.runtime.nodes import DetectorNode, Listener
 
         decoder = ScanDecoder(load_profile(args.profile), args.objects)
-        detector = Detector(load_bank(args.preset), capacity=args.objects)
+        bank = load_bank(args.preset)
         health, changes = Health(), LaneChanges()
         listeners: list[Listener] = [changes]
         csv = ReportCsv(args.csv) if args.csv else None
         if csv is not None:
             listeners.append(csv)
+        # last, because it may compile: what is wrong with the options has been said by now
+        detector = Detector(bank, capacity=args.objects)
         encoder = ManoeuvreEncoder()
         node = DetectorNode(decoder, detector, encoder, health, listeners, args.objects)
-    finally:
-        notice.cancel()
     return Detection(node, encoder, health, changes, csv)
 
 

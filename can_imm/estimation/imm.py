@@ -18,7 +18,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from can_imm.estimation.constraints import project_, truncate_, truncated_normal
+from can_imm.estimation.constraints import LOG_MASS_FLOOR, project_, truncate_, truncated_normal
 from can_imm.estimation.kalman import log_normal, predict_, update_row_, update_state_
 from can_imm.estimation.particles import (
     N_COLUMNS,
@@ -34,8 +34,11 @@ from can_imm.types import FloatArray
 
 LOG_FLOOR = -1e30
 
-NEGLIGIBLE = 1e-4
-"""A source less probable than this uses the chain's transition probabilities as they are."""
+NEGLIGIBLE_WEIGHT = 1e-12
+"""A source with a smaller mixing weight does not count."""
+
+UNREACHABLE = 1e-15
+"""A mode whose prior probability is smaller is not computed; it gets the floor probability."""
 
 MAX_ROWS = 4
 """Largest number of constraint rows of one kind in one mode."""
@@ -123,6 +126,7 @@ WORK_DTYPE = np.dtype(
         ("P", np.float64, (_M, _N, _N)),
         ("c", np.float64, (_M,)),
         ("w", np.float64, (_M,)),
+        ("mu", np.float64, (_M,)),
         ("sx", np.float64, (_M, _N)),
         ("tx", np.float64, (_N,)),
         ("tP", np.float64, (_N, _N)),
@@ -190,12 +194,13 @@ def transitions_(bank: Any, obj: Any, work: Any, m: int) -> None:  # pragma: no 
     going from i to j is that of the chain times the mass which source i, moved on by ``m`` steps
     with its own model, has inside j's regions; each row is normalised again, so that a source
     loses nothing to a mode it cannot reach.  States that the entry replaces do not count.
+    ``work.mu`` holds the probabilities of the modes that are present.
     """
     n_modes, n = bank.n_modes, bank.n_states
     for i in range(n_modes):
         for j in range(n_modes):
             work.Pi[i, j] = bank.Pi[m, i, j]
-        if obj.mu[i] < NEGLIGIBLE:
+        if work.mu[i] == 0.0:
             continue
         for s in range(n):
             v = 0.0
@@ -343,6 +348,8 @@ def update_mode_(
                 n, work.tx, work.tP, s, work.lower[c], work.upper[c], bank.var_floor, work.row
             )
     log_l += correct_(n, x, P, z, r, valid, age, work.h, work.row)
+    if prior < LOG_MASS_FLOOR + 1.0:
+        return LOG_FLOOR  # the constraint contradicts the past beyond what numbers can tell
     posterior = 0.0
     if n_bounds > 0 and bank.is_projected[j]:
         # The mass needs the Gaussian before it is projected.
@@ -446,8 +453,8 @@ def update_particles_(
 def present_(bank: Any, obj: Any, w: FloatArray) -> None:  # pragma: no cover - compiled
     """Mode probabilities without those at the floor, normalised, into w (M,).
 
-    The floor keeps a mode alive, but its state may be anything: a mode that ends at x = 10 m would
-    widen the covariance of an object at 70 m.
+    A mode at the floor is not there and its state may be anything: a mode that ends at x = 10 m
+    would widen the covariance of an object at 70 m.  It comes back by transitions from the others.
     """
     total = 0.0
     for j in range(bank.n_modes):
@@ -565,25 +572,19 @@ def cycle_(
     n_modes, n = bank.n_modes, bank.n_states
     if surprise(bank, obj, m, z, r, valid, age) > gate:
         return OUTLIER
+    present_(bank, obj, work.mu)
     transitions_(bank, obj, work, m)
     for j in range(n_modes):
         c = 0.0
         for i in range(n_modes):
-            c += work.Pi[i, j] * obj.mu[i]
+            work.w[i] = work.Pi[i, j] * work.mu[i]
+            c += work.w[i]
         work.c[j] = c
-    for j in range(n_modes):
-        # A mode at the floor is not there: its state may be anything, so it is no source.
-        total = 0.0
         for i in range(n_modes):
-            w = work.Pi[i, j] * obj.mu[i]
-            if w <= 1e-12 * work.c[j] or (i != j and obj.mu[i] <= 2.0 * bank.mu_floor):
-                w = 0.0
-            work.w[i] = w
-            total += w
-        for i in range(n_modes):
-            work.w[i] = work.w[i] / total if total > 0.0 else 0.0
+            work.w[i] = work.w[i] / c if work.w[i] > NEGLIGIBLE_WEIGHT * c else 0.0
         log_l = LOG_FLOOR
-        if not total > 0.0:
+        if c < UNREACHABLE:
+            work.c[j] = 0.0
             keep_combined_(n, obj, work.x[j], work.P[j])
         elif bank.is_particle[j]:
             log_l = update_particles_(
@@ -593,7 +594,11 @@ def cycle_(
             mix_(bank, obj, work, j)
             predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
             log_l = update_mode_(bank, work, j, z, r, valid, age)
-        obj.log_l[j] = log_l if log_l > LOG_FLOOR else LOG_FLOOR
+        if not log_l > LOG_FLOOR:
+            # Also a numeric failure: what is left of its state must not reach the others.
+            keep_combined_(n, obj, work.x[j], work.P[j])
+            log_l = LOG_FLOOR
+        obj.log_l[j] = log_l
     if not normalise_(n_modes, obj.mu, obj.log_l, work.c, bank.mu_floor):
         return FAILED
     for j in range(n_modes):

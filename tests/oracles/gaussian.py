@@ -41,10 +41,7 @@ def truncate(x, P, s, low, high):
     sd = np.sqrt(P[s, s])
     a, b = (low - x[s]) / sd, (high - x[s]) / sd
     mean, variance = truncnorm.stats(a, b, moments="mv")
-    if a + b > 0:
-        log_mass = _log_difference(a, b)
-    else:
-        log_mass = _log_difference(-b, -a)
+    log_mass = _log_difference(a, b) if a + b > 0 else _log_difference(-b, -a)
     k = P[:, s] / P[s, s]
     return (
         x + k * sd * mean,
@@ -54,6 +51,7 @@ def truncate(x, P, s, low, high):
 
 
 def _log_difference(a, b):
+    """Log of the mass in [a, b] from the upper tails."""
     la, lb = norm.logsf(a), norm.logsf(b)
     return la + np.log1p(-np.exp(lb - la))
 

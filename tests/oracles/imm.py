@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import multivariate_normal
-
 from oracles.gaussian import truncate, update
+from scipy.stats import multivariate_normal
 
 
 @dataclass
@@ -31,7 +30,11 @@ class Mode:
 
 @dataclass
 class Imm:
-    """The estimate: one Gaussian per mode and the mode probabilities."""
+    """The estimate: one Gaussian per mode and the mode probabilities.
+
+    With a ``floor``, a mode whose probability is at most twice the floor is not there: it counts
+    neither as a source nor in the combined estimate.
+    """
 
     modes: list[Mode]
     x: list[np.ndarray]
@@ -55,8 +58,9 @@ class Imm:
 
     def cycle(self, Pi: np.ndarray, H: np.ndarray, R: np.ndarray, z: np.ndarray) -> None:
         """One cycle with Pi[i, j] from i to j."""
-        c = Pi.T @ self.mu
-        priors = [self.mixed(j, Pi[:, j] * self.mu / c[j]) for j in range(len(self.modes))]
+        mu = self.present()
+        c = Pi.T @ mu
+        priors = [self.mixed(j, Pi[:, j] * mu / c[j]) for j in range(len(self.modes))]
         log_mu = np.zeros(len(self.modes))
         for j, (mode, (x, P)) in enumerate(zip(self.modes, priors, strict=True)):
             x, P = mode.F @ x, mode.F @ P @ mode.F.T + mode.Q
@@ -77,19 +81,21 @@ class Imm:
 
     def combined(self) -> tuple[np.ndarray, np.ndarray]:
         """(19)(20)."""
-        return mixture(self.mu, self.x, self.P)
+        return mixture(self.present(), self.x, self.P)
+
+    def present(self) -> np.ndarray:
+        w = np.where(self.mu > 2.0 * self.floor, self.mu, 0.0)
+        return w / w.sum()
 
     def extrapolated(self, Pi, Fs, Qs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Every mode moved on by itself; the chain moved on by Pi."""
         xs = [F @ x for F, x in zip(Fs, self.x, strict=True)]
         Ps = [F @ P @ F.T + Q for F, P, Q in zip(Fs, self.P, Qs, strict=True)]
-        return *mixture(self.mu, xs, Ps), Pi.T @ self.mu
+        return *mixture(self.present(), xs, Ps), Pi.T @ self.mu
 
 
 def mixture(weights, xs, Ps):
     """Mean and covariance of a Gaussian mixture."""
     mean = sum(w * x for w, x in zip(weights, xs, strict=True))
-    P = sum(
-        w * (P + np.outer(x - mean, x - mean)) for w, x, P in zip(weights, xs, Ps, strict=True)
-    )
+    P = sum(w * (P + np.outer(x - mean, x - mean)) for w, x, P in zip(weights, xs, Ps, strict=True))
     return mean, P
