@@ -48,7 +48,7 @@ def damaged(log: str) -> str:
     lines = log.splitlines(keepends=True)
     scans = [lines[i : i + 3] for i in range(0, len(lines), 3)]  # RadarScan and two RadarObjects
     head, _, data = scans[30][1].partition("#")
-    scans[20][:0] = ["# battery changed here\n", scans[20][0][:25] + "\n"]  # garbage, a cut line
+    scans[20][:0] = ["# battery changed here\n", scans[20][0][:28] + "\n"]  # garbage, a cut line
     scans[30][1] = f"{head}#{int(data, 16) ^ 0x10_0000:016X}\n"  # one wrong bit: wrong CRC
     scans[40] = ["DROPCOUNT: dropped 3 CAN frames on 'can0' socket (total drops 3)\n"]
     del scans[50][2]  # the second object's frame is missing

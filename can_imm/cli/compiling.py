@@ -1,7 +1,8 @@
-"""Tells the user that numba is compiling: once per version and machine, and it takes a while."""
+"""What a command does while numba compiles: once per version and machine, and it takes a while."""
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,10 +10,14 @@ from contextlib import contextmanager
 
 @contextmanager
 def announced() -> Iterator[None]:
-    """Say on standard error when something has to be compiled that is not in numba's cache."""
+    """Say on standard error when something has to be compiled that is not in numba's cache.
+
+    Meanwhile SIGINT and SIGTERM end the process at once: an exception that a handler raises inside
+    one of numba's callbacks would be swallowed, and the compilation fail for it later.
+    """
     from numba.core import event
 
-    class Notice(event.Listener):  # type: ignore[misc]
+    class Notice(event.Listener):
         said = False
 
         def on_start(self, _: object) -> None:
@@ -27,5 +32,11 @@ def announced() -> Iterator[None]:
         def on_end(self, _: object) -> None:
             pass
 
-    with event.install_listener("numba:compile", Notice()):
-        yield
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    previous = [signal.signal(number, signal.SIG_DFL) for number in numbers]
+    try:
+        with event.install_listener("numba:compile", Notice()):
+            yield
+    finally:
+        for number, action in zip(numbers, previous, strict=True):
+            signal.signal(number, action)

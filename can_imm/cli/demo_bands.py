@@ -43,7 +43,7 @@ _NONE = -1
 def bands(track: Track, at_ns: int, duration_ns: int, width: int) -> list[Text]:
     """Four lines of ``width`` cells: true, said, where they differ, and a scale in seconds.
 
-    What is still to come at scenario time ``at_ns`` [ns] is shown in outline, and of the truth only.
+    What is still to come at scenario time ``at_ns`` [ns] is shown dimly, and of the truth only.
     """
     n = width - _NAME - 1
     edges = np.linspace(0, duration_ns, n + 1)

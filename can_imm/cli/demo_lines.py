@@ -24,17 +24,17 @@ if TYPE_CHECKING:
 
     from can_imm.cli.demo_run import DemoRun, Track
 
-SWITCHES = "switches\n{:g} true"
+SWITCHES = "switches\n{:.3g} true"
 COLUMNS = {
-    "accu-\nracy": ("accuracy", 4),
-    "\n±0.5s": ("accuracy_tol_0_5", 4),
+    "accu-\nracy": ("accuracy", 3),
+    "\n±0.5s": ("accuracy_tol_0_5", 3),
     "macro\nF1": ("macro_f1", 3),
-    "delay\n[s]": ("mean_delay_s", 2),
+    "delay\ns": ("mean_delay_s", 2),
     SWITCHES: ("switches", 0),
-    "x\n[m]": ("rmse_x", 4),
-    "vx\n[m/s]": ("rmse_vx", 4),
-    "y\n[m]": ("rmse_y", 4),
-    "vy\n[m/s]": ("rmse_vy", 4),
+    "RMSE\nx m": ("rmse_x", 4),
+    "RMSE\nvx m/s": ("rmse_vx", 4),
+    "RMSE\ny m": ("rmse_y", 4),
+    "RMSE\nvy m/s": ("rmse_vy", 4),
 }
 """Column of the summary -> metric and decimals."""
 
@@ -79,7 +79,7 @@ def print_summary(show: DemoRun, console: Console, title: str, preset: str) -> N
     for system in ("rules", "kalman", "measurement"):
         answers = answer(system, scans, seen, 0)
         rows[system] = summarise([score(*pair) for pair in zip(seen, answers, strict=True)])
-    rows["paper, Table 6"] = {f"rmse_{state}": (rmse, 0.0) for state, rmse in TABLE_6.items()}
+    rows["Table 6"] = {f"rmse_{state}": (rmse, 0.0) for state, rmse in TABLE_6.items()}
     truth = summarise(
         [evaluate(one.t_ns, one.label, one.state, one.label, None, None, None) for one in seen]
     )
@@ -95,6 +95,7 @@ def print_summary(show: DemoRun, console: Console, title: str, preset: str) -> N
     console.print(_table(rows, truth["switches"][0]))
     console.print()
     console.print(_bus_lines(show))
+    console.print("kalman: one Kalman filter; rules: thresholds on one; Table 6: the paper's RMSE.")
     console.print("One run is one run: 'can-imm study paper' has the statistics of many.")
 
 

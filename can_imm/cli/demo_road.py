@@ -43,18 +43,18 @@ class Road:
         self._border_y = lane_width / 2
         self._cells = [[(" ", "")] * width for _ in range(2 * lane_rows + 1)]
         self._cells[lane_rows] = [("╌" if c % 6 < 3 else " ", "white") for c in range(width)]
-        for line, name in ((0, "left lane"), (2 * lane_rows, "right lane")):
+        for line, name in ((lane_rows - 1, "left lane"), (2 * lane_rows, "right lane")):
             self._write(line, width - len(name), name, "dim")
         self._draw(Car(-CAR_LENGTH, 0.0, "", "bright_white"))
-        self._write(2 * lane_rows + 1 - lane_rows // 2 - 1, self._column(0.0) + 1, "ego", "dim")
+        self._write(self._line(0.0), self._column(0.0) + 1, "ego", "dim")
 
     def add(self, car: Car) -> None:
         """Draw a car with its label beside it."""
         self._draw(car)
-        line = min(max(int(self._height(car.y) // 2), 0), 2 * self._lane_rows)
         after = self._column(car.x + CAR_LENGTH) + 1
         before = self._column(car.x) - 1 - len(car.text)
-        self._write(line, after if after + len(car.text) <= self._width else before, *_label(car))
+        column = after if after + len(car.text) <= self._width else before
+        self._write(self._line(car.y), column, car.text, car.style)
 
     def lines(self) -> list[Text]:
         """The road from edge to edge, and a scale in metres."""
@@ -82,6 +82,9 @@ class Road:
         """Halves of a line from the top."""
         return 2 * self._lane_rows + 1 - (y - self._border_y) / self._half
 
+    def _line(self, y: float) -> int:
+        return min(max(int((self._height(y) - 0.5) // 2), 0), 2 * self._lane_rows)
+
     def _column(self, x: float) -> int:
         return round((x + BEHIND) / self._metres)
 
@@ -93,10 +96,6 @@ class Road:
             if at + len(text) <= self._width:
                 line[at : at + len(text)] = text
         return Text("".join(line), "dim")
-
-
-def _label(car: Car) -> tuple[str, str]:
-    return car.text, car.style
 
 
 def _text(row: Sequence[tuple[str, str]]) -> Text:

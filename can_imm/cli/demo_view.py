@@ -84,7 +84,9 @@ class LiveView:
             [self._header(at_ns, width)],
             self._road(width, lane_rows),
             [self._verdict(track, k)],
-            _side_by_side(_bars(track, k, min(width - _TABLE_WIDTH - 3, _BARS_WIDTH)), self._states(track, k)),
+            _side_by_side(
+                _bars(track, k, min(width - _TABLE_WIDTH - 3, _BARS_WIDTH)), self._states(track, k)
+            ),
             [Text()],
             bands(track, at_ns, show.duration_ns, width),
             self._bus(),

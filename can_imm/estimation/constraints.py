@@ -17,7 +17,7 @@ SQRT_2 = math.sqrt(2.0)
 LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 LOG_MASS_FLOOR = -700.0
 """Smallest log mass that is told apart: a tail of exp(-700) begins 37 sigma away."""
-NARROW = 0.2
+NARROW = 0.05
 """Below this width of an interval differences of tails lose digits: quadrature takes over."""
 _NODES, _WEIGHTS = (tuple(map(float, column)) for column in np.polynomial.legendre.leggauss(6))
 

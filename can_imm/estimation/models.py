@@ -48,7 +48,7 @@ def generator_from_dwell(dwell_s: FloatArray, weights: FloatArray) -> FloatArray
     """
     W = np.array(weights, float)
     np.fill_diagonal(W, 0.0)
-    G = W / W.sum(axis=1, keepdims=True) / np.asarray(dwell_s, float)[:, None]
+    G: FloatArray = W / W.sum(axis=1, keepdims=True) / np.asarray(dwell_s, float)[:, None]
     np.fill_diagonal(G, -G.sum(axis=1))
     return G
 
@@ -60,7 +60,7 @@ def generator_from_matrix(Pi: FloatArray, period_s: float) -> FloatArray:
     They are clipped, and the other rates of the row scaled so that the mode is left as often as
     before; for the paper's Table 2 no entry of the result is wrong by more than 0.008.
     """
-    G = np.real(logm(np.asarray(Pi, float))) / period_s
+    G: FloatArray = np.real(logm(np.asarray(Pi, float))) / period_s
     leaving = np.maximum(-np.diag(G), 0.0)
     np.fill_diagonal(G, 0.0)
     G = np.maximum(G, 0.0)
@@ -72,9 +72,10 @@ def generator_from_matrix(Pi: FloatArray, period_s: float) -> FloatArray:
 
 def transition_table(G: FloatArray, step_s: float, n_steps: int) -> FloatArray:
     """Pi[m] = expm(G m step_s), (n_steps, M, M); Pi[m, i, j] is the transition from i to j."""
-    table = np.array([expm(G * (m * step_s)) for m in range(n_steps)])
+    table: FloatArray = np.array([expm(G * (m * step_s)) for m in range(n_steps)])
     table = np.maximum(table, 0.0)
-    return table / table.sum(axis=2, keepdims=True)
+    table /= table.sum(axis=2, keepdims=True)
+    return table
 
 
 def stationary(Pi: FloatArray) -> FloatArray:

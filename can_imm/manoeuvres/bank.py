@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,8 @@ from can_imm.types import CanImmError, FloatArray, Manoeuvre
 
 STATES = ("x", "vx", "y", "vy", "ax", "ay")
 PRESETS = Path(__file__).parent / "presets"
+LARGEST = 1e6
+"""No number of a preset is larger: nothing on a road is, and nothing can overflow."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +83,19 @@ def load_bank(name_or_path: str, *, step_ns: int = 10_000_000) -> ModeBank:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as e:
         raise CanImmError(f"{path}: {e.strerror or e}") from e
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
-        raise CanImmError(f"{path}: {e}") from e
+    except (ValueError, RecursionError) as e:  # of TOML, of UTF-8, of numbers, of nesting
+        raise CanImmError(f"{path}: not a TOML file: {e}") from e
     return bank_from_dict(data, str(path), step_ns=step_ns)
+
+
+_KINDS = {
+    str: "string", float: "number", int: "whole number", bool: "true or false", list: "list",
+    dict: "table",
+}  # fmt: skip
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 class _Table:
@@ -95,7 +108,7 @@ class _Table:
         self.data = dict(data)
 
     def error(self, text: str) -> CanImmError:
-        return CanImmError(f"{self.where}: {text}")
+        return CanImmError(" ".join(f"{self.where}: {text}".splitlines()))
 
     def take(self, key: str, kind: type, default: Any = None) -> Any:
         if key not in self.data:
@@ -103,32 +116,35 @@ class _Table:
                 raise self.error(f"'{key}' is missing")
             return default
         value = self.data.pop(key)
-        if kind is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-            raise self.error(f"'{key}' must be a {kind.__name__}, not {value!r}")
+        fits = _is_number(value) if kind is float else isinstance(value, kind)
+        if not fits or (kind is int and isinstance(value, bool)):
+            raise self.error(f"'{key}' must be a {_KINDS[kind]}, not {reprlib.repr(value)}")
         return value
 
     def number(
         self,
         key: str,
         default: float | None = None,
-        low: float = -math.inf,
+        low: float = -LARGEST,
+        high: float = LARGEST,
         *,
         open_low: bool = False,
     ) -> float:
-        value = float(self.take(key, float, default))
-        if math.isnan(value) or value < low or (open_low and value <= low):
-            raise self.error(f"'{key}' = {value} is out of range")
-        return value
+        value = self.take(key, float, default)
+        if not low <= value <= high or (open_low and value == low):
+            what = "above" if open_low else "from"
+            raise self.error(f"'{key}' must be {what} {low:g} to {high:g}, not {value}")
+        return float(value)
 
-    def numbers(self, key: str, count: int) -> FloatArray:
+    def numbers(self, key: str, count: int, low: float = 0.0) -> list[float]:
+        """A list of numbers above ``low``."""
         values = self.take(key, list)
-        if len(values) != count or any(
-            isinstance(v, bool) or not isinstance(v, (int, float)) or not v > 0 for v in values
-        ):
-            raise self.error(f"'{key}' must be {count} positive numbers")
-        return np.array(values, float)
+        if len(values) != count or not all(_is_number(v) and low < v <= LARGEST for v in values):
+            raise self.error(
+                f"'{key}' must be {count} numbers above {low:g} to {LARGEST:g},"
+                f" not {reprlib.repr(values)}"
+            )
+        return [float(v) for v in values]
 
     def done(self) -> None:
         if self.data:
@@ -153,7 +169,7 @@ def _axis(table: _Table, has_acceleration: bool) -> tuple[FloatArray, FloatArray
     elif kind == "singer":
         if not has_acceleration:
             raise table.error("model 'singer' needs the axis' acceleration among the states")
-        tau = table.number("tau_s", low=0.0, open_low=True)
+        tau = table.number("tau_s", low=0.01)
         sigma = table.number("acceleration_std", low=0.0)
         A[1, 2] = 1.0
         A[2, 2] = -1.0 / tau
@@ -223,7 +239,7 @@ def _fill_constraints(
     for c, row in enumerate(rows):
         s = _state(row, states)
         record["soft_state"][j, c] = s
-        record["soft_r"][j, c] = row.number("r", low=0.0)
+        record["soft_r"][j, c] = row.number("r", low=0.0, open_low=True)
         record["soft_kind"][j, c], record["soft_lanes"][j, c] = _lane(row, states[s], lanes)
         record["soft_value"][j, c] = row.number(
             "value", 0.0 if record["soft_kind"][j, c] == LANE else None
@@ -235,8 +251,8 @@ def _fill_constraints(
         s = _state(row, states)
         record["bound_state"][j, c] = s
         record["bound_kind"][j, c], record["bound_lanes"][j, c] = _lane(row, states[s], lanes)
-        low = row.number("min", -math.inf)
-        high = row.number("max", math.inf)
+        low = row.number("min", -math.inf, -math.inf)
+        high = row.number("max", math.inf, high=math.inf)
         if not low < high:
             raise row.error(f"bounds are empty: min {low} is not below max {high}")
         record["bound_lower"][j, c] = low
@@ -263,12 +279,8 @@ def _fill_particle(record: Any, table: _Table) -> int:
     count: int = table.take("count", int)
     if not 10 <= count <= 100_000:
         raise table.error(f"'count' = {count} is out of range")
-    corners = table.take("profile", list)
-    if (
-        len(corners) != 4
-        or any(not isinstance(c, (int, float)) for c in corners)
-        or not corners[0] < corners[1] <= corners[2] < corners[3]
-    ):
+    corners = table.numbers("profile", 4, low=-LARGEST)
+    if not corners[0] < corners[1] <= corners[2] < corners[3]:
         raise table.error("'profile' must be four rising distances of the trapezoid's corners")
     length = corners[3] - corners[0]
     p["up"] = (corners[1] - corners[0]) / length
@@ -277,18 +289,15 @@ def _fill_particle(record: Any, table: _Table) -> int:
     p["entry"] = corners[0]
     for key in ("peak", "length"):
         # 'length' is in metres for the absolute profile, else per m/s of peak speed
-        if p["absolute"] and key == "length":
-            span = [length, length]
-        else:
-            span = table.take(key, list)
-        if len(span) != 2 or not 0 < span[0] <= span[1]:
-            raise table.error(f"'{key}' must be [low, high] with 0 < low <= high")
-        p[f"{key}_low"], p[f"{key}_high"] = span
-    p["f_min"] = table.number("f_min", low=0.0)
-    window = table.take("window", list)
-    if len(window) != 2 or not window[0] < window[1]:
+        fixed = p["absolute"] and key == "length"
+        low, high = (length, length) if fixed else table.numbers(key, 2)
+        if not low <= high:
+            raise table.error(f"'{key}' must be [low, high] with low <= high")
+        p[f"{key}_low"], p[f"{key}_high"] = low, high
+    p["f_min"] = table.number("f_min", low=0.0, high=float(p["peak_low"]))
+    p["y_low"], p["y_high"] = table.numbers("window", 2, low=-LARGEST)
+    if not p["y_low"] < p["y_high"]:
         raise table.error("'window' must be [low, high] of y with low < high")
-    p["y_low"], p["y_high"] = window
     p["std_x"] = table.number("std_x", low=0.0)
     p["std_profile"] = table.number("std_profile", low=0.0)
     p["q_vy"] = table.number("q_vy", low=0.0)
@@ -301,43 +310,40 @@ def _transitions(
     table: _Table,
     names: list[str],
     dwell: list[float],
-    following: list[dict[str, Any]],
+    following: list[_Table],
     step_s: float,
     n_steps: int,
 ) -> FloatArray:
-    """Pi[m] from the modes' dwell times, or from a printed matrix and its period."""
-    if "matrix" not in table.data:
-        table.done()
+    """Pi[m] from the modes' dwell times and what follows, or from a matrix and its period."""
+    if following:
         weights = np.zeros((len(names), len(names)))
         for i, row in enumerate(following):
-            for target, weight in row.items():
-                where = f"{table.where.partition(',')[0]}, mode '{names[i]}', next"
-                if target not in names:
-                    raise CanImmError(f"{where}: unknown mode '{target}'")
-                if not isinstance(weight, (int, float)) or not weight >= 0 or target == names[i]:
-                    raise CanImmError(f"{where}: bad weight {target} = {weight!r}")
-                weights[i, names.index(target)] = weight
+            for target in list(row.data):
+                if target not in names or target == names[i]:
+                    raise row.error(f"'{target}' is no other mode")
+                weights[i, names.index(target)] = row.number(target, low=0.0)
             if not weights[i].sum() > 0:
-                raise CanImmError(
-                    f"{table.where.partition(',')[0]}, mode '{names[i]}': 'next' names no mode"
-                )
+                raise row.error("no mode follows")
         return transition_table(generator_from_dwell(np.array(dwell), weights), step_s, n_steps)
     rows = table.take("matrix", list)
-    period = table.number("period_s", low=0.0, open_low=True)
+    period = table.number("period_s", low=0.01)
     table.done()
     m = len(names)
     if len(rows) != m or any(not isinstance(r, list) or len(r) != m for r in rows):
         raise table.error(f"'matrix' must be {m} x {m}, one row and one column per mode")
-    try:
-        Pi = np.array(rows, float)
-    except (TypeError, ValueError):
-        raise table.error("'matrix' must hold numbers") from None
-    for name, row in zip(names, Pi, strict=True):
-        if not np.all((row >= 0.0) & (row <= 1.0)):
-            raise table.error(f"row '{name}' of 'matrix' has an entry that is no probability")
-        if abs(row.sum() - 1.0) > 1e-9:
-            raise table.error(f"row '{name}' of 'matrix' sums to {row.sum():.6g}, not to 1")
-    result = transition_table(generator_from_matrix(Pi, period), step_s, n_steps)
+    for name, row in zip(names, rows, strict=True):
+        for entry in row:
+            if not (_is_number(entry) and 0.0 <= entry <= 1.0):
+                raise table.error(
+                    f"row '{name}' of 'matrix': {reprlib.repr(entry)} is no probability"
+                )
+        if abs(sum(row) - 1.0) > 1e-9:
+            raise table.error(f"row '{name}' of 'matrix' sums to {sum(row):.6g}, not to 1")
+    Pi = np.array(rows, float)
+    G = generator_from_matrix(Pi, period)
+    if not np.abs(transition_table(G, period, 2)[1] - Pi).max() < 0.05:
+        raise table.error("'matrix' is not near to any Markov chain in continuous time")
+    result = transition_table(G, step_s, n_steps)
     at = round(period / step_s)
     if 0 < at < n_steps and math.isclose(at * step_s, period):
         result[at] = Pi  # as printed where it was meant
@@ -370,16 +376,20 @@ def bank_from_dict(
     lanes: dict[str, tuple[int, int]] = {}
     for key in list(lanes_table.data):
         span = lanes_table.take(key, list)
-        if len(span) != 2 or any(type(v) is not int for v in span) or span[0] > span[1]:
+        if (
+            len(span) != 2
+            or not all(type(v) is int and abs(v) <= 100 for v in span)
+            or span[0] > span[1]
+        ):
             raise lanes_table.error(f"'{key}' must be [lowest, highest] lane number")
         lanes[key] = (span[0], span[1])
     modes = top.take("mode", list)
     if not modes:
         raise top.error("there is no [[mode]]")
-    names = [
-        m.get("name", f"#{i + 1}") if isinstance(m, dict) else f"#{i + 1}"
-        for i, m in enumerate(modes)
-    ]
+    names: list[str] = []
+    for i, mode in enumerate(modes, 1):
+        label = mode.get("name") if isinstance(mode, dict) else None
+        names.append(label if isinstance(label, str) and label else f"#{i}")
     mode_tables = [_Table(m, f"{where}, mode '{n}'") for n, m in zip(names, modes, strict=True)]
     if len(set(names)) != len(names):
         raise top.error("two modes have the same name")
@@ -392,13 +402,13 @@ def bank_from_dict(
     record["n_modes"], record["n_states"] = m, n
     record["step_s"] = step_s
     record["lane_width"] = width
-    record["mu_floor"] = top.number("probability_floor", 1e-6, low=0.0)
+    record["mu_floor"] = top.number("probability_floor", 1e-6, low=0.0, high=0.01)
     record["var_floor"] = top.number("variance_floor", 1e-8, low=0.0, open_low=True)
     record["birth_std"][:n] = top.numbers("birth_std", n)
     record["jump_std"] = top.numbers("jump_std", 4)
     variance = None
     if "measurement_variance" in top.data:
-        variance = top.numbers("measurement_variance", 4)
+        variance = np.array(top.numbers("measurement_variance", 4))
     n_particles = 0
     if "particles" in top.data:
         n_particles = _fill_particle(
@@ -410,7 +420,7 @@ def bank_from_dict(
     manoeuvres: list[Manoeuvre] = []
     direction = np.zeros(m, np.int8)
     dwell: list[float] = []
-    following: list[dict[str, Any]] = []
+    following: list[_Table] = []
     for j, mode in enumerate(mode_tables):
         mode.take("name", str)
         label = mode.take("manoeuvre", str)
@@ -423,6 +433,10 @@ def bank_from_dict(
             raise mode.error(f"'direction' must be left, right or none, not '{side}'")
         direction[j] = {"left": 1, "right": -1, "none": 0}[side]
         record["is_particle"][j] = mode.take("particles", bool, False)
+        if record["is_particle"][j]:
+            for key in ("soft", "bounds", "entry", "project"):
+                if key in mode.data:
+                    raise mode.error(f"a mode with particles takes no '{key}'")
         record["is_projected"][j] = mode.take("project", bool, False)
         if not record["is_particle"][j]:
             F, Q = _motion(mode, states, step_s)
@@ -435,11 +449,13 @@ def bank_from_dict(
         record["F"][:n_steps, j, :n, :n], record["Q"][:n_steps, j, :n, :n] = tables
         _fill_constraints(record, j, mode, names, states, lanes)
         if not from_matrix:
-            dwell.append(mode.number("dwell_s", low=0.0, open_low=True))
-            following.append(mode.take("next", dict))
+            dwell.append(mode.number("dwell_s", low=0.01))
+            following.append(_Table(mode.take("next", dict), f"{mode.where}, next"))
         mode.done()
     if record["is_particle"].sum() > 1:
         raise top.error("only one mode can have particles")
+    if n_particles and not record["is_particle"].any():
+        raise top.error("there is a [particles] table, but no mode has 'particles = true'")
     record["manoeuvre"][:m] = manoeuvres
     record["direction"][:m] = direction
     Pi = _transitions(transition, names, dwell, following, step_s, n_steps)

@@ -120,7 +120,7 @@ def moments(a: float, b: float) -> tuple[float, float, float]:
     return log_mass - (0.5 * a * a if a > 0 else 0.0), start + u * reach, variance
 
 
-ENDS = [-np.inf, -9.0, -5.0, -2.0, -0.3, 0.0, 0.7, 1.9, 4.99, 5.0, 5.01, 6.5, 8.0, 10.0, np.inf]
+ENDS = [-np.inf, -9.0, -5.0, -2.0, -0.3, 0.0, 0.7, 1.9, 4.99, 5.0, 5.01, 6.5, 10.0, 15.0, 30.0, 36.0, np.inf]
 INTERVALS = [(a, b) for a in ENDS for b in ENDS if a < b and (np.isfinite(a) or np.isfinite(b))]
 
 
@@ -138,7 +138,7 @@ def test_truncated_normal_without_bounds_is_the_normal() -> None:
 
 
 @pytest.mark.parametrize("width", [1e-9, 1e-6, 1e-4, 1e-3, 1e-2, 0.03, 0.1, 0.5])
-@pytest.mark.parametrize("a", [-10.0, -4.0, -0.01, 0.0, 0.5, 3.0, 7.0, 9.0])
+@pytest.mark.parametrize("a", [-35.0, -10.0, -4.0, -0.01, 0.0, 0.5, 3.0, 7.0, 20.0, 37.0])
 def test_truncated_normal_in_narrow_intervals(a: float, width: float) -> None:
     b = a + width
     width = b - a
@@ -152,14 +152,14 @@ def test_truncated_normal_in_narrow_intervals(a: float, width: float) -> None:
     assert variance == pytest.approx(expected[2], rel=1e-5)
 
 
-@pytest.mark.parametrize("a", [11.0, 20.0, 39.0, 200.0])
+@pytest.mark.parametrize("a", [38.0, 60.0, 200.0])
 @pytest.mark.parametrize("width", [1e-3, 1.0, np.inf])
 def test_truncated_normal_beyond_the_floor(a: float, width: float) -> None:
     """So far out the mass is clipped and the point nearest to 0 stands for the interval."""
     assert truncated_normal(a, a + width) == (LOG_MASS_FLOOR, a, 0.0)
     assert truncated_normal(-a - width, -a) == (LOG_MASS_FLOOR, -a, 0.0)
-    # what it stands for is within a tenth of a standard deviation
-    assert abs(moments(a, a + width)[1] - a) < 0.1
+    # what it stands for is near
+    assert abs(moments(a, a + width)[1] - a) < 0.03
 
 
 @given(st.floats(-300.0, 300.0), st.floats(0.0, 600.0, exclude_min=True) | st.just(np.inf))
@@ -202,8 +202,8 @@ def test_truncation_equals_brute_force_in_two_dimensions(seed: int) -> None:
 
 def test_truncation_keeps_the_floor() -> None:
     x, P = np.zeros(2), np.array([[1.0, 0.9], [0.9, 1.0]])
-    assert truncate_(2, x, P, 0, 30.0, 31.0, 0.01, np.empty((3, 2))) == LOG_MASS_FLOOR
-    assert x == pytest.approx([30.0, 27.0])
+    assert truncate_(2, x, P, 0, 40.0, 41.0, 0.01, np.empty((3, 2))) == LOG_MASS_FLOOR
+    assert x == pytest.approx([40.0, 36.0])
     assert P[0, 0] == pytest.approx(0.01)
     assert np.linalg.eigvalsh(P).min() > 0.0
 

@@ -154,6 +154,7 @@ def test_the_mass_of_a_region_moves_the_transition() -> None:
     add_bound(runner.bank, 1, 0, 0.3, np.inf, mass=True)
     add_bound(runner.bank, 2, 0, -np.inf, 0.3, mass=True)
     add_bound(runner.bank, 2, 1, -1.0, 1.0)  # not a matter of the transition
+    runner.work[0]["mu"][:3] = oracle.mu
     imm.transitions_(runner.bank[0], runner.objects[0], runner.work[0], 5)
     expected = Pi.copy()
     for i, mode in enumerate(oracle.modes):
@@ -171,6 +172,7 @@ def test_a_state_that_the_entry_replaces_does_not_count_in_the_transition() -> N
     record = runner.bank[0]
     record["entry_mean"][1, 1], record["entry_var"][1, 1] = 55.0, 1.0
     record["entry_sources"][0, 1] = 1 << 1
+    runner.work[0]["mu"][:2] = 0.5
     imm.transitions_(record, runner.objects[0], runner.work[0], 5)
     np.testing.assert_allclose(runner.work[0]["Pi"][0, :2], Pi[0], rtol=1e-12)
     assert runner.work[0]["Pi"][1, 1] < 1e-12, "staying counts: nothing is replaced there"

@@ -180,12 +180,12 @@ def test_missing_components_drop_out_of_the_density() -> None:
     assert log_l == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_bound_out_of_reach_is_clipped_and_finite() -> None:
+def test_a_bound_out_of_reach_makes_the_mode_impossible() -> None:
     bank = blank(1, 2)
     add_bound(bank, 0, 0, 1e4, 2e4)
     z, r = np.append(Z, [0.0, 0.0]), np.append(R, [1.0, 1.0])
     log_l, x, P = log_likelihood(bank, X, COV, z, r)
-    assert np.isfinite(log_l)
+    assert log_l == imm.LOG_FLOOR
     assert np.isfinite(x).all()
     assert np.linalg.eigvalsh(P).min() > -1e-9
 
