@@ -58,11 +58,12 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         bus = stack.enter_context(open_bus_from(args))
         source, sink = BusSource(bus), BusSink(bus)
+        detection = build(args)
+        stack.callback(detection.close)
+        # last, because it replaces an existing file: what is wrong with the options has been said
         log = LogSink(args.log) if args.log else None
         if log is not None:
             stack.callback(log.close)
-        detection = build(args)
-        stack.callback(detection.close)
         health = detection.health
         # What came while the estimators were made ready is old.
         while source.recv(0.0) is not None:

@@ -52,11 +52,12 @@ def run(args: argparse.Namespace) -> int:
         raise CanImmError(f"--out {args.out}: this is the log that is read")
     with ExitStack() as stack:
         source = stack.enter_context(LogSource(args.log))
+        detection = build(args)
+        stack.callback(detection.close)
+        # last, because it replaces an existing file: what is wrong with the options has been said
         out = LogSink(args.out) if args.out else None
         if out is not None:
             stack.callback(out.close)
-        detection = build(args)
-        stack.callback(detection.close)
         clock = PacedClock() if args.realtime else FastClock()
         feed = LogFeed(source, clock, detection.health, OUTPUT_IDS)
         loop = Loop(feed, detection.node, detection.health, recorders=[out] if out else [])

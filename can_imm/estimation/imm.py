@@ -74,6 +74,8 @@ BANK_DTYPE = np.dtype(
         ("mu_floor", np.float64),
         ("var_floor", np.float64),
         ("lane_width", np.float64),
+        ("lane_range", np.float64, (2,)),
+        ("lane_prior", np.float64),
         ("soft_value", np.float64, (_M, _K)),
         ("soft_lanes", np.float64, (_M, _K, 2)),
         ("soft_r", np.float64, (_M, _K)),
@@ -115,10 +117,16 @@ OBJECT_DTYPE = np.dtype(
         ("log_l", np.float64, (_M,)),
         ("mean", np.float64, (_N,)),
         ("cov", np.float64, (_N, _N)),
+        ("lane_width", np.float64),
+        ("lane_scans", np.float64),
     ],
     align=True,
 )
-"""Estimator state of one object: per mode at its last measurement, and the combined estimate."""
+"""Estimator state of one object: per mode at its last measurement, and the combined estimate.
+
+``lane_width`` is the distance of the lane centres that this object keeps to, learned in
+``lane_scans`` scans.
+"""
 
 WORK_DTYPE = np.dtype(
     [
@@ -137,6 +145,7 @@ WORK_DTYPE = np.dtype(
         ("upper", np.float64, (_K,)),
         ("Pi", np.float64, (_M, _M)),
         ("var", np.float64, (_N,)),
+        ("lane_width", np.float64),
         ("source", np.int64, (_M,)),
     ],
     align=True,
@@ -223,7 +232,7 @@ def transitions_(bank: Any, obj: Any, work: Any, m: int) -> None:  # pragma: no 
                 ):
                     continue
                 base = reference(
-                    bank.bound_kind[j, c], bank.bound_lanes[j, c], bank.lane_width, work.tx[s]
+                    bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, work.tx[s]
                 )
                 sd = math.sqrt(work.var[s])
                 log_mass += truncated_normal(
@@ -252,7 +261,7 @@ def reference(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def constrain_soft_(
-    bank: Any, j: int, x: FloatArray, P: FloatArray, row: FloatArray
+    bank: Any, j: int, x: FloatArray, P: FloatArray, work: Any
 ) -> float:  # pragma: no cover - compiled
     """Apply the soft equality rows of mode j as pseudo-measurements (22)(23); 0, or NaN on failure.
 
@@ -264,9 +273,9 @@ def constrain_soft_(
     for c in range(bank.n_soft[j]):
         s = bank.soft_state[j, c]
         value = bank.soft_value[j, c] + reference(
-            bank.soft_kind[j, c], bank.soft_lanes[j, c], bank.lane_width, x[s]
+            bank.soft_kind[j, c], bank.soft_lanes[j, c], work.lane_width, x[s]
         )
-        bad += 0.0 * update_state_(n, x, P, s, value, bank.soft_r[j, c], row)[1]
+        bad += 0.0 * update_state_(n, x, P, s, value, bank.soft_r[j, c], work.row)[1]
     return bad
 
 
@@ -330,7 +339,7 @@ def update_mode_(
     x = work.x[j]
     P = work.P[j]
     n = bank.n_states
-    log_l = constrain_soft_(bank, j, x, P, work.row)
+    log_l = constrain_soft_(bank, j, x, P, work)
     n_bounds = bank.n_bounds[j]
     prior = 0.0
     if n_bounds > 0:
@@ -341,7 +350,7 @@ def update_mode_(
         for c in range(n_bounds):
             s = bank.bound_state[j, c]
             # The lane is that of the prior, for the posterior too.
-            base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], bank.lane_width, x[s])
+            base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, x[s])
             work.lower[c] = base + bank.bound_lower[j, c]
             work.upper[c] = base + bank.bound_upper[j, c]
             prior += truncate_(
@@ -519,6 +528,31 @@ OK, OUTLIER, FAILED = 0, 1, 2
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def learn_lane_(bank: Any, obj: Any) -> None:  # pragma: no cover - compiled
+    """Learn where the lanes lie from where the object keeps to one.
+
+    A mode with a soft lane row that is more likely than not tells the centre of its lane; lane 0
+    lies at y = 0 and tells nothing about the width.  The bank's width counts as much as
+    ``lane_prior`` scans; 0 switches learning off.
+    """
+    if bank.lane_prior <= 0.0:
+        return
+    for j in range(bank.n_modes):
+        if obj.mu[j] < 0.5:
+            continue
+        for c in range(bank.n_soft[j]):
+            if bank.soft_kind[j, c] != LANE:
+                continue
+            y = obj.x[j, bank.soft_state[j, c]]
+            k = reference(LANE, bank.soft_lanes[j, c], 1.0, y / obj.lane_width)
+            if k != 0.0:
+                obj.lane_scans = min(obj.lane_scans + 1.0, 10.0 * bank.lane_prior)
+                gain = 1.0 / (bank.lane_prior + obj.lane_scans)
+                width = obj.lane_width + gain * (y / k - obj.lane_width)
+                obj.lane_width = min(max(width, bank.lane_range[0]), bank.lane_range[1])
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def surprise(
     bank: Any, obj: Any, m: int, z: FloatArray, r: FloatArray, valid: Any, age: float
 ) -> float:  # pragma: no cover - compiled
@@ -572,6 +606,7 @@ def cycle_(
     n_modes, n = bank.n_modes, bank.n_states
     if surprise(bank, obj, m, z, r, valid, age) > gate:
         return OUTLIER
+    work.lane_width = obj.lane_width
     present_(bank, obj, work.mu)
     transitions_(bank, obj, work, m)
     for j in range(n_modes):
@@ -607,6 +642,7 @@ def cycle_(
             for t in range(n):
                 obj.P[j, s, t] = work.P[j, s, t]
     combine_(bank, obj, work)
+    learn_lane_(bank, obj)
     return OK
 
 
@@ -621,6 +657,9 @@ def birth_(
     are honest ones.  Regions count with the mass that the measurement alone gives them.
     """
     n_modes, n = bank.n_modes, bank.n_states
+    obj.lane_width = bank.lane_width
+    obj.lane_scans = 0.0
+    work.lane_width = bank.lane_width
     for j in range(n_modes):
         x = work.x[j]
         P = work.P[j]
@@ -639,7 +678,7 @@ def birth_(
             s = bank.bound_state[j, c]
             if bank.bound_mass[j, c] and s < 4 and valid[s]:
                 base = reference(
-                    bank.bound_kind[j, c], bank.bound_lanes[j, c], bank.lane_width, z[s]
+                    bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, z[s]
                 )
                 sd = math.sqrt(r[s])
                 work.c[j] *= math.exp(

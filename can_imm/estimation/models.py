@@ -72,9 +72,12 @@ def generator_from_matrix(Pi: FloatArray, period_s: float) -> FloatArray:
 
 def transition_table(G: FloatArray, step_s: float, n_steps: int) -> FloatArray:
     """Pi[m] = expm(G m step_s), (n_steps, M, M); Pi[m, i, j] is the transition from i to j."""
-    table: FloatArray = np.array([expm(G * (m * step_s)) for m in range(n_steps)])
-    table = np.maximum(table, 0.0)
-    table /= table.sum(axis=2, keepdims=True)
+    step = np.maximum(expm(G * step_s), 0.0)
+    table = np.zeros((n_steps, len(G), len(G)))
+    table[0] = np.eye(len(G))
+    for m in range(1, n_steps):
+        table[m] = table[m - 1] @ step
+        table[m] /= table[m].sum(axis=1, keepdims=True)
     return table
 
 

@@ -133,7 +133,9 @@ class _Table:
         value = self.take(key, float, default)
         if not low <= value <= high or (open_low and value == low):
             what = "above" if open_low else "from"
-            raise self.error(f"'{key}' must be {what} {low:g} to {high:g}, not {value}")
+            raise self.error(
+                f"'{key}' must be {what} {low:g} to {high:g}, not {reprlib.repr(value)}"
+            )
         return float(value)
 
     def numbers(self, key: str, count: int, low: float = 0.0) -> list[float]:
@@ -373,6 +375,7 @@ def bank_from_dict(
         raise top.error("'states' must be x, vx, y, vy and then, if wanted, ax or ax, ay")
     lanes_table = _Table(top.take("lanes", dict), f"{where}, lanes")
     width = lanes_table.number("width", low=0.0, open_low=True)
+    record_lane_prior = lanes_table.number("learn_scans", 0.0, low=0.0)
     lanes: dict[str, tuple[int, int]] = {}
     for key in list(lanes_table.data):
         span = lanes_table.take(key, list)
@@ -402,6 +405,8 @@ def bank_from_dict(
     record["n_modes"], record["n_states"] = m, n
     record["step_s"] = step_s
     record["lane_width"] = width
+    record["lane_range"] = width * 0.8, width * 1.3
+    record["lane_prior"] = record_lane_prior
     record["mu_floor"] = top.number("probability_floor", 1e-6, low=0.0, high=0.01)
     record["var_floor"] = top.number("variance_floor", 1e-8, low=0.0, open_low=True)
     record["birth_std"][:n] = top.numbers("birth_std", n)

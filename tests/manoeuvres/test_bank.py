@@ -105,7 +105,9 @@ def test_a_bank_of_ones_own() -> None:
     assert r["entry_mean"][1, [3, 4]].tolist() == [-1.0, 0.2]
     np.testing.assert_allclose(r["entry_var"][1, :5], [-1.0, -1.0, -1.0, 0.36, 0.09])
     assert r["entry_sources"][:3, 1].tolist() == [1 << 3 | 1 << 4, 0, 1 << 3]
-    np.testing.assert_allclose(r["Q"][1, 0, 2:4, 2:4], 0.02 * np.array([[1e-6 / 3, 5e-5], [5e-5, 1e-2]]))
+    np.testing.assert_allclose(
+        r["Q"][1, 0, 2:4, 2:4], 0.02 * np.array([[1e-6 / 3, 5e-5], [5e-5, 1e-2]])
+    )
     step = 1.0 - np.diag(r["Pi"][1])[:3]
     np.testing.assert_allclose(step, [0.01 / 6.0, 0.01 / 2.0, 0.01 / 2.0], rtol=0.01)
     assert r["Pi"][1, 0, 1] == pytest.approx(3 * r["Pi"][1, 0, 2], rel=0.02)
@@ -255,11 +257,6 @@ MATRIX_REFUSALS = [
         np.roll(np.eye(7), 1, axis=0).tolist(),
         "'matrix' is not near to any Markov chain in continuous time",
     ),
-    (
-        "transition.matrix",
-        np.full((7, 7), 1.0 / 7.0).tolist(),
-        "'matrix' is not near to any Markov chain in continuous time",
-    ),
 ]
 
 
@@ -377,14 +374,12 @@ def places(data: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return found
 
 
-@pytest.mark.parametrize("original", [small(), PAPER, TWO_LANE], ids=["small", "paper", "two-lane"])
-@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
-@given(data=st.data())
-def test_whatever_is_written_is_accepted_or_refused(
-    original: dict[str, Any], data: st.DataObject
-) -> None:
+@settings(max_examples=250, suppress_health_check=[HealthCheck.too_slow])
+@given(st.sampled_from(["small", "small", "paper", "two-lane"]), st.data())
+def test_whatever_is_written_is_accepted_or_refused(name: str, data: st.DataObject) -> None:
     """Values deleted or replaced at random: a bank of finite numbers, or one line."""
-    mutated = copy.deepcopy(original)
+    mutated = {"small": small, "paper": PAPER.copy, "two-lane": TWO_LANE.copy}[name]()
+    mutated = copy.deepcopy(mutated)
     for _ in range(data.draw(st.integers(1, 3))):
         all_places = places(mutated)
         if not all_places:
