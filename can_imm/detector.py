@@ -13,6 +13,9 @@ from can_imm.manoeuvres import ModeBank
 from can_imm.reporting import extrapolate_all_, fill_reports_
 from can_imm.types import REPORT_DTYPE, CanImmError, FloatArray, IntArray, Scan
 
+LARGEST = 1e6
+"""A measured value, or standard deviation, beyond this is invalid; squares cannot overflow."""
+
 
 @dataclass(slots=True)
 class DetectorCounts:
@@ -25,7 +28,8 @@ class DetectorCounts:
         missed_scans: gaps in the sensor's scan counter.
         measurements: object measurements that updated a track or began one.
         outliers: measurements too far from anything the object could do; the track coasts.
-        invalid: measurements that are not finite, or without any valid component.
+        invalid: measurements that are no numbers, whose standard deviation is none, or without any
+            valid component.
         numeric_failures: cycles that gave no finite result; the track starts anew.
         overflow: measurements for which no slot was free.
         duplicates: second and later measurements of one id in one scan.
@@ -169,7 +173,8 @@ class Detector:
         n = scan.n
         self._measured[:] = False
         self._assign(scan, now)
-        np.square(scan.std[:n], out=self._r[:n])
+        np.clip(scan.std[:n], 0.0, LARGEST, out=self._r[:n])
+        np.square(self._r[:n], out=self._r[:n])
         if self.bank.measurement_variance is not None:
             self._r[:n] = self.bank.measurement_variance
         self._process(scan, n, (t_ns - scan.t_ns) * 1e-9)
@@ -218,8 +223,9 @@ class Detector:
     def _assign(self, scan: Scan, now: int) -> None:
         """Give every row of the scan its slot (-1: none) and the steps since its last update."""
         seen: set[int] = set()
-        finite = np.isfinite(scan.z[: scan.n]) & np.isfinite(scan.std[: scan.n])
-        usable = scan.valid[: scan.n] & finite & (scan.std[: scan.n] > 0.0)
+        std = scan.std[: scan.n]
+        usable = (np.abs(scan.z[: scan.n]) < LARGEST) & (std > 0.0) & (std < LARGEST)
+        usable &= scan.valid[: scan.n]
         for k in range(scan.n):
             self._slot[k] = -1
             name = int(scan.ids[k])

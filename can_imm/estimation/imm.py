@@ -30,7 +30,7 @@ from can_imm.estimation.particles import (
     resample_,
     weigh_,
 )
-from can_imm.types import FloatArray
+from can_imm.types import VX, FloatArray, X
 
 LOG_FLOOR = -1e30
 
@@ -154,14 +154,18 @@ WORK_DTYPE = np.dtype(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def mix_(bank: Any, obj: Any, work: Any, j: int) -> None:  # pragma: no cover - compiled
+def mix_(bank: Any, obj: Any, work: Any, j: int, m: int) -> None:  # pragma: no cover - compiled
     """Interaction (15)(16) for target mode j: mixed mean and covariance into work.x[j], work.P[j].
 
     Where bit s of ``entry_sources[i, j]`` is set, state s of source i is replaced by the mode's
     entry distribution: what a vehicle that starts this manoeuvre does, not what it did before.
+    Where that is the speed ahead, the change took place at some instant of the last ``m`` steps,
+    all equally likely: x is set back accordingly, with exact first and second moments.  (Sideways
+    the same would only blur a lane change, whose speed builds up within the interval.)
     ``work.w`` holds the mixing weights.
     """
     n_modes, n = bank.n_modes, bank.n_states
+    tau = m * bank.step_s
     n_sources = 0
     for i in range(n_modes):
         if work.w[i] > 0.0:
@@ -174,6 +178,8 @@ def mix_(bank: Any, obj: Any, work: Any, j: int) -> None:  # pragma: no cover - 
             d = obj.x[i, s]
             if bank.entry_sources[i, j] >> s & 1:
                 d = bank.entry_mean[j, s]
+            elif s == X and bank.entry_sources[i, j] >> VX & 1:
+                d -= 0.5 * tau * (bank.entry_mean[j, VX] - obj.x[i, VX])
             work.sx[k, s] = d
             v += work.w[i] * d
         for k in range(n_sources):
@@ -190,6 +196,12 @@ def mix_(bank: Any, obj: Any, work: Any, j: int) -> None:  # pragma: no cover - 
                     p += obj.P[i, s, t]
                 elif s == t:
                     p += bank.entry_var[j, s]
+                elif s == VX and t == X and bank.entry_sources[i, j] >> VX & 1:
+                    p -= 0.5 * tau * bank.entry_var[j, VX]
+                if s == X and t == X and bank.entry_sources[i, j] >> VX & 1:
+                    dv = bank.entry_mean[j, VX] - obj.x[i, VX]
+                    spread = bank.entry_var[j, VX] + obj.P[i, VX, VX]
+                    p += tau * obj.P[i, X, VX] + tau * tau * (spread / 3.0 + dv * dv / 12.0)
                 v += work.w[i] * p
             work.P[j, s, t] = v
             work.P[j, t, s] = v
@@ -227,9 +239,7 @@ def transitions_(bank: Any, obj: Any, work: Any, m: int) -> None:  # pragma: no 
             log_mass = 0.0
             for c in range(bank.n_bounds[j]):
                 s = bank.bound_state[j, c]
-                if not bank.bound_mass[j, c] or (
-                    bank.entry_sources[i, j] >> s & 1
-                ):
+                if not bank.bound_mass[j, c] or (bank.entry_sources[i, j] >> s & 1):
                     continue
                 base = reference(
                     bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, work.tx[s]
@@ -626,7 +636,7 @@ def cycle_(
                 bank, obj, work, j, m, z, r, valid, age, particles, spare, weights, rng
             )
         else:
-            mix_(bank, obj, work, j)
+            mix_(bank, obj, work, j, m)
             predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
             log_l = update_mode_(bank, work, j, z, r, valid, age)
         if not log_l > LOG_FLOOR:

@@ -98,6 +98,11 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
+def _show(value: Any) -> str:
+    text = reprlib.repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
 class _Table:
     """A TOML table whose keys are taken one by one, so that what is left over is a mistake."""
 
@@ -118,7 +123,7 @@ class _Table:
         value = self.data.pop(key)
         fits = _is_number(value) if kind is float else isinstance(value, kind)
         if not fits or (kind is int and isinstance(value, bool)):
-            raise self.error(f"'{key}' must be a {_KINDS[kind]}, not {reprlib.repr(value)}")
+            raise self.error(f"'{key}' must be a {_KINDS[kind]}, not {_show(value)}")
         return value
 
     def number(
@@ -133,9 +138,7 @@ class _Table:
         value = self.take(key, float, default)
         if not low <= value <= high or (open_low and value == low):
             what = "above" if open_low else "from"
-            raise self.error(
-                f"'{key}' must be {what} {low:g} to {high:g}, not {reprlib.repr(value)}"
-            )
+            raise self.error(f"'{key}' must be {what} {low:g} to {high:g}, not {_show(value)}")
         return float(value)
 
     def numbers(self, key: str, count: int, low: float = 0.0) -> list[float]:
@@ -143,8 +146,7 @@ class _Table:
         values = self.take(key, list)
         if len(values) != count or not all(_is_number(v) and low < v <= LARGEST for v in values):
             raise self.error(
-                f"'{key}' must be {count} numbers above {low:g} to {LARGEST:g},"
-                f" not {reprlib.repr(values)}"
+                f"'{key}' must be {count} numbers above {low:g} to {LARGEST:g}, not {_show(values)}"
             )
         return [float(v) for v in values]
 
@@ -253,8 +255,8 @@ def _fill_constraints(
         s = _state(row, states)
         record["bound_state"][j, c] = s
         record["bound_kind"][j, c], record["bound_lanes"][j, c] = _lane(row, states[s], lanes)
-        low = row.number("min", -math.inf, -math.inf)
-        high = row.number("max", math.inf, high=math.inf)
+        low = row.number("min") if "min" in row.data else -math.inf
+        high = row.number("max") if "max" in row.data else math.inf
         if not low < high:
             raise row.error(f"bounds are empty: min {low} is not below max {high}")
         record["bound_lower"][j, c] = low
@@ -336,9 +338,7 @@ def _transitions(
     for name, row in zip(names, rows, strict=True):
         for entry in row:
             if not (_is_number(entry) and 0.0 <= entry <= 1.0):
-                raise table.error(
-                    f"row '{name}' of 'matrix': {reprlib.repr(entry)} is no probability"
-                )
+                raise table.error(f"row '{name}' of 'matrix': {_show(entry)} is no probability")
         if abs(sum(row) - 1.0) > 1e-9:
             raise table.error(f"row '{name}' of 'matrix' sums to {sum(row):.6g}, not to 1")
     Pi = np.array(rows, float)

@@ -143,3 +143,4 @@ def copy_state(oracle: Imm, obj: Any) -> None:
         obj["x"][j, :n], obj["P"][j, :n, :n] = x, P
     obj["mu"][: len(oracle.x)] = oracle.mu
     obj["mean"][:n], obj["cov"][:n, :n] = oracle.combined()
+    obj["lane_width"] = 3.0

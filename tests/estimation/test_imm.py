@@ -443,3 +443,45 @@ def test_surprise_is_the_distance_from_what_is_possible() -> None:
     valid[0] = False
     value = imm.surprise(bank[0], obj[0], 10, z, R, valid, 0.02)
     assert value == pytest.approx(d[1:].sum(), rel=1e-12)
+
+
+# ---- lanes
+
+
+def keep_left(width: float, y: float, scans: int, prior: float = 10.0) -> float:
+    """Lane width that is learned from an object that stays at ``y``."""
+    bank = blank(1, 4)
+    record = bank[0]
+    record["lane_width"], record["lane_prior"], record["lane_range"] = width, prior, [2.4, 4.0]
+    record["Q"][10, 0, range(4), range(4)] = 0.1
+    add_soft(bank, 0, 2, 0.0, 0.1, (-1, 2))
+    runner = Runner(bank, 1)
+    for k in range(scans):
+        runner.scan([0], [10 if k else -1], [20.0, 0.0, y, 0.0], R)
+    return float(runner.objects[0]["lane_width"])
+
+
+@pytest.mark.parametrize(("y", "width"), [(3.5, 3.5), (-3.5, 3.5), (6.8, 3.4), (9.0, 4.0)])
+def test_the_lane_width_is_learned_where_the_object_keeps_to_a_lane(y: float, width: float) -> None:
+    """From lane 1, lane -1 and lane 2; never beyond the range."""
+    assert keep_left(3.0, y, 2000) == pytest.approx(width, abs=0.03)
+
+
+def test_the_right_lane_says_nothing_of_the_width() -> None:
+    assert keep_left(3.0, 0.4, 100) == 3.0
+
+
+def test_a_lane_width_can_be_fixed() -> None:
+    assert keep_left(3.0, 3.5, 100, prior=0.0) == 3.0
+
+
+def test_a_new_object_in_the_slot_knows_no_lanes() -> None:
+    bank = blank(1, 4)
+    bank[0]["lane_prior"], bank[0]["lane_range"] = 10.0, [2.4, 4.0]
+    add_soft(bank, 0, 2, 0.0, 0.1, (0, 1))
+    runner = Runner(bank, 1)
+    runner.scan([0], [-1], [20.0, 0.0, 3.5, 0.0], R)
+    runner.scan([0], [10], [20.0, 0.0, 3.5, 0.0], R)
+    assert runner.objects[0]["lane_width"] > 3.0
+    runner.scan([0], [-1], [20.0, 0.0, 3.5, 0.0], R)
+    assert runner.objects[0]["lane_width"] == 3.0

@@ -20,11 +20,12 @@ INF = math.inf
 VALID_2 = np.array([True, True, False, False])
 
 
-def log_likelihood(bank, x, P, z, r, valid=VALID_2, age=0.0):
+def log_likelihood(bank, x, P, z, r, valid=VALID_2, age=0.0, lane_width=3.0):
     """Of mode 0 by the kernel; also the updated mean and covariance."""
     n = int(bank[0]["n_states"])
     work = np.zeros(1, imm.WORK_DTYPE)
     work[0]["x"][0, :n], work[0]["P"][0, :n, :n] = x, P
+    work[0]["lane_width"] = lane_width
     log_l = imm.update_mode_(bank[0], work[0], 0, z, r, valid, age)
     return log_l, work[0]["x"][0, :n], work[0]["P"][0, :n, :n]
 
@@ -164,10 +165,9 @@ def test_rows_count_from_the_nearest_lane(y: float, lanes: tuple[int, int], cent
     logs = []
     for shift, where in ((0.0, lanes), (centre, None)):
         bank = blank(1, 4)
-        bank[0]["lane_width"] = 3.5
         add_soft(bank, 0, 2, shift + 0.2, 0.1, where)
         add_bound(bank, 0, 2, shift - 0.6, shift + 0.5, lanes=where)
-        logs.append(log_likelihood(bank, x, np.eye(4), z, r, valid))
+        logs.append(log_likelihood(bank, x, np.eye(4), z, r, valid, lane_width=3.5))
     assert logs[0][0] == pytest.approx(logs[1][0], abs=1e-12)
     np.testing.assert_allclose(logs[0][1], logs[1][1], atol=1e-12)
 
