@@ -43,6 +43,9 @@ UNREACHABLE = 1e-15
 MAX_ROWS = 4
 """Largest number of constraint rows of one kind in one mode."""
 
+SPEED_STEP = 1 << VX
+"""Bit of ``entry_sources``: the entry replaces the speed ahead."""
+
 FIXED, LANE = 0, 1
 """What the numbers of a row refer to: zero, or the nearest lane centre in a range of lanes."""
 
@@ -178,7 +181,7 @@ def mix_(bank: Any, obj: Any, work: Any, j: int, m: int) -> None:  # pragma: no 
             d = obj.x[i, s]
             if bank.entry_sources[i, j] >> s & 1:
                 d = bank.entry_mean[j, s]
-            elif s == X and bank.entry_sources[i, j] >> VX & 1:
+            elif s == X and bank.entry_sources[i, j] & SPEED_STEP:
                 d -= 0.5 * tau * (bank.entry_mean[j, VX] - obj.x[i, VX])
             work.sx[k, s] = d
             v += work.w[i] * d
@@ -196,15 +199,26 @@ def mix_(bank: Any, obj: Any, work: Any, j: int, m: int) -> None:  # pragma: no 
                     p += obj.P[i, s, t]
                 elif s == t:
                     p += bank.entry_var[j, s]
-                elif s == VX and t == X and bank.entry_sources[i, j] >> VX & 1:
-                    p -= 0.5 * tau * bank.entry_var[j, VX]
-                if s == X and t == X and bank.entry_sources[i, j] >> VX & 1:
-                    dv = bank.entry_mean[j, VX] - obj.x[i, VX]
-                    spread = bank.entry_var[j, VX] + obj.P[i, VX, VX]
-                    p += tau * obj.P[i, X, VX] + tau * tau * (spread / 3.0 + dv * dv / 12.0)
                 v += work.w[i] * p
             work.P[j, s, t] = v
             work.P[j, t, s] = v
+    for k in range(n_sources):
+        i = work.source[k]
+        if not bank.entry_sources[i, j] & SPEED_STEP:
+            continue
+        # x - a (v_new - v_old), the change a seconds before the end of the interval
+        dv = bank.entry_mean[j, VX] - obj.x[i, VX]
+        spread = bank.entry_var[j, VX] + obj.P[i, VX, VX]
+        p = tau * obj.P[i, X, VX] + tau * tau * (spread / 3.0 + dv * dv / 12.0)
+        work.P[j, X, X] += work.w[i] * p
+        for s in range(1, n):
+            p = 0.0
+            if s == VX:
+                p = -0.5 * tau * bank.entry_var[j, VX]
+            elif not bank.entry_sources[i, j] >> s & 1:
+                p = 0.5 * tau * obj.P[i, VX, s]
+            work.P[j, s, X] += work.w[i] * p
+            work.P[j, X, s] = work.P[j, s, X]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

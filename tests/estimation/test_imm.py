@@ -135,7 +135,7 @@ def test_each_entry_state_has_its_own_sources() -> None:
     runner = Runner(bank, 1)
     copy_state(Imm([], xs, Ps, w), runner.objects[0])
     runner.work[0]["w"][:3] = w
-    imm.mix_(bank[0], runner.objects[0], runner.work[0], 2)
+    imm.mix_(bank[0], runner.objects[0], runner.work[0], 2, 0)
     for i, s, mean, variance in ((0, 1, 0.7, 0.3), (1, 3, -0.2, 0.1)):
         xs[i][s] = mean
         Ps[i][s, :] = Ps[i][:, s] = 0.0

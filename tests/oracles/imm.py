@@ -28,6 +28,33 @@ class Mode:
     entry_from: frozenset[int] = frozenset()
 
 
+def enter(x, P, entry: dict[int, tuple[float, float]], tau: float):
+    """Mean and covariance of a source whose entry states are replaced.
+
+    A new speed (state 1) began a seconds before the end of the interval, a uniform in (0, tau); the
+    position, which the prediction moves on at the new speed for all of tau, is set back by that:
+    x' = x + (tau - b)(v_old - v_new) with b uniform as well.  Moments by the linear map A0 + b' A1.
+    """
+    n = len(x)
+    new = sorted(entry)
+    mean = np.concatenate([x, [entry[s][0] for s in new]])
+    cov = np.zeros((len(mean), len(mean)))
+    cov[:n, :n] = P
+    cov[n:, n:] = np.diag([entry[s][1] for s in new])
+    A0 = np.eye(n, len(mean))
+    for k, s in enumerate(new):
+        A0[s] = 0.0
+        A0[s, n + k] = 1.0
+    A1 = np.zeros_like(A0)
+    if 1 in entry and 0 not in entry:
+        A1[0, 1], A1[0, n + new.index(1)] = 1.0, -1.0
+    first, second = tau / 2, tau**2 / 3
+    step = A1 @ mean
+    P = A0 @ cov @ A0.T + first * (A0 @ cov @ A1.T + A1 @ cov @ A0.T) + second * A1 @ cov @ A1.T
+    P += (second - first**2) * np.outer(step, step)
+    return A0 @ mean + first * step, P
+
+
 @dataclass
 class Imm:
     """The estimate: one Gaussian per mode and the mode probabilities.
@@ -41,17 +68,14 @@ class Imm:
     P: list[np.ndarray]
     mu: np.ndarray
     floor: float = 0.0
+    tau: float = 0.05
 
     def mixed(self, j: int, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(15)(16), with the entry states replaced for the sources that enter the mode."""
         xs, Ps = [], []
         for i, (x, P) in enumerate(zip(self.x, self.P, strict=True)):
-            x, P = x.copy(), P.copy()
             if i in self.modes[j].entry_from:
-                for s, (mean, variance) in self.modes[j].entry.items():
-                    x[s] = mean
-                    P[s, :] = P[:, s] = 0.0
-                    P[s, s] = variance
+                x, P = enter(x, P, self.modes[j].entry, self.tau)
             xs.append(x)
             Ps.append(P)
         return mixture(weights, xs, Ps)
