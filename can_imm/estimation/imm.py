@@ -280,7 +280,7 @@ def reference(
     """
     if kind == FIXED:
         return 0.0
-    return min(max(math.floor(y / width + 0.5), lanes[0]), lanes[1]) * width
+    return float(min(max(math.floor(y / width + 0.5), lanes[0]), lanes[1]) * width)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -8,7 +8,7 @@ from filterpy.kalman import IMMEstimator, KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.gaussian import random_covariance
-from oracles.imm import Imm, Mode
+from oracles.imm import Imm, Mode, enter
 from scipy.stats import norm
 from small_banks import (
     Runner,
@@ -143,6 +143,52 @@ def test_each_entry_state_has_its_own_sources() -> None:
     mean, cov = Imm([], xs, Ps, w).combined()
     np.testing.assert_allclose(runner.work[0]["x"][2, :4], mean, rtol=1e-12)
     np.testing.assert_allclose(runner.work[0]["P"][2, :4, :4], cov, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {1: (2.0, 0.5)},
+        {1: (2.0, 0.5), 4: (-0.3, 0.2)},
+        {1: (2.0, 0.5), 2: (0.1, 0.4), 3: (0.0, 0.0)},
+        {0: (30.0, 1.0), 1: (2.0, 0.5)},
+    ],
+    ids=str,
+)
+def test_a_new_speed_sets_in_at_any_instant_of_the_interval(
+    entry: dict[int, tuple[float, float]],
+) -> None:
+    """Correlated source, half a second: x and its covariances with everything else follow."""
+    rng = np.random.default_rng(4)
+    bank = blank(2, 5)
+    record = bank[0]
+    for s, (mean, variance) in entry.items():
+        record["entry_mean"][1, s], record["entry_var"][1, s] = mean, variance
+        record["entry_sources"][0, 1] |= 1 << s
+    x, P = rng.normal(0.0, 2.0, 5), random_covariance(rng, 5)
+    runner = Runner(bank, 1)
+    copy_state(Imm([], [x, x], [P, P], np.array([1.0, 0.0])), runner.objects[0])
+    runner.work[0]["w"][:2] = [1.0, 0.0]
+    imm.mix_(record, runner.objects[0], runner.work[0], 1, 50)
+    mean, cov = enter(x, P, entry, 0.5)
+    np.testing.assert_allclose(runner.work[0]["x"][1, :5], mean, rtol=1e-12)
+    np.testing.assert_allclose(runner.work[0]["P"][1, :5, :5], cov, rtol=1e-12, atol=1e-14)
+
+
+def test_a_speed_step_covers_the_way_that_two_speeds_cover() -> None:
+    """The oracle's linear map itself against a simulation of the step at a random instant."""
+    rng = np.random.default_rng(0)
+    x, P, tau, n = np.array([1.0, -2.0, 0.5, 0.3]), random_covariance(rng, 4), 0.5, 400_000
+    old = rng.multivariate_normal(x, P, n)
+    instant, speed = rng.uniform(0.0, tau, n), rng.normal(2.0, 0.7, n)
+    end = old.copy()
+    end[:, 0] += instant * old[:, 1] + (tau - instant) * speed
+    end[:, 1] = speed
+    mean, cov = enter(x, P, {1: (2.0, 0.49)}, tau)
+    F = np.eye(4)
+    F[0, 1] = tau
+    np.testing.assert_allclose(end.mean(axis=0), F @ mean, atol=0.01)
+    np.testing.assert_allclose(np.cov(end.T), F @ cov @ F.T, atol=0.015)
 
 
 # ---- transitions that depend on the state
