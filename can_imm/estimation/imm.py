@@ -204,7 +204,7 @@ def mix_(bank: Any, obj: Any, work: Any, j: int, m: int) -> None:  # pragma: no 
             work.P[j, t, s] = v
     for k in range(n_sources):
         i = work.source[k]
-        if not bank.entry_sources[i, j] & SPEED_STEP:
+        if bank.entry_sources[i, j] & (SPEED_STEP | 1 << X) != SPEED_STEP:
             continue
         # x - a (v_new - v_old), the change a seconds before the end of the interval
         dv = bank.entry_mean[j, VX] - obj.x[i, VX]
@@ -442,8 +442,7 @@ def update_particles_(
     total = particles.shape[0]
     x = work.x[j]
     P = work.P[j]
-    # Systematic allocation of the particles to the sources; nothing is drawn for a window that
-    # no source can reach within this cycle.
+    # systematic allocation of the particles to the sources
     done = 0
     cumulative = 0.0
     u = rng.random()
