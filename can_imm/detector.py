@@ -24,8 +24,7 @@ class DetectorCounts:
     Attributes:
         scans: scans that were used.
         late_scans: older than the last used one, or older than the table of elapsed steps reaches.
-        repeated_scans: same time and counter as the last used one.
-        missed_scans: gaps in the sensor's scan counter.
+        repeated_scans: the last used one once more, by its time or by its counter.
         measurements: object measurements that updated a track or began one.
         outliers: measurements too far from anything the object could do; the track coasts.
         invalid: measurements that are no numbers, whose standard deviation is none, or without any
@@ -41,7 +40,6 @@ class DetectorCounts:
     scans: int = 0
     late_scans: int = 0
     repeated_scans: int = 0
-    missed_scans: int = 0
     measurements: int = 0
     outliers: int = 0
     invalid: int = 0
@@ -73,7 +71,6 @@ class Detector:
         gate: a measurement is an outlier if its squared distance from what is possible
             (`imm.surprise`) is larger; chi-square with 4 degrees of freedom.
         max_outliers: after so many outliers in a row the id is taken to name another object.
-        counter_modulus: the scan counter wraps to 0 here.
     """
 
     def __init__(
@@ -85,7 +82,6 @@ class Detector:
         coast_s: float = 0.5,
         gate: float = 25.0,
         max_outliers: int = 3,
-        counter_modulus: int = 16,
     ) -> None:
         if capacity < 1:
             raise CanImmError(f"the detector needs at least one object slot, not {capacity}")
@@ -98,7 +94,6 @@ class Detector:
         self._coast_steps = min(int(coast_s * 1e9) // bank.step_ns, imm.MAX_STEPS - 1)
         self._gate = gate
         self._max_outliers = max_outliers
-        self._modulus = counter_modulus
         self._rng = np.random.default_rng(seed)
         self._objects = np.zeros(capacity, imm.OBJECT_DTYPE)
         self._work = np.zeros(1, imm.WORK_DTYPE)
@@ -180,7 +175,7 @@ class Detector:
         self._process(scan, n, (t_ns - scan.t_ns) * 1e-9)
         self._settle(scan, now)
         self._bury(now)
-        return self._report(scan.t_ns, now)
+        return self._report(t_ns, now)
 
     def predict(self, t_ns: int) -> int:
         """Extrapolate every tracked object to the step at ``t_ns`` into `predicted`.
@@ -205,7 +200,10 @@ class Detector:
     def _accept(self, t_ns: int, scan: Scan) -> bool:
         """Late and repeated scans are counted and not used: a filter cannot go back in time."""
         if self._last_t_ns >= 0:
-            if scan.t_ns == self._last_t_ns and scan.counter == self._last_counter:
+            # A counter that stands still means old data; after a long silence it means nothing.
+            recent = scan.t_ns - self._last_t_ns <= self._coast_steps * self._step_ns
+            same = scan.counter == self._last_counter
+            if same and (scan.t_ns == self._last_t_ns or (scan.counter >= 0 and recent)):
                 self.counts.repeated_scans += 1
                 return False
             if scan.t_ns <= self._last_t_ns:
@@ -214,8 +212,6 @@ class Detector:
         if t_ns - scan.t_ns >= self._coast_steps * self._step_ns:
             self.counts.late_scans += 1
             return False
-        if scan.counter >= 0 and self._last_counter >= 0:
-            self.counts.missed_scans += (scan.counter - self._last_counter - 1) % self._modulus
         self._last_t_ns, self._last_counter = scan.t_ns, scan.counter
         self.counts.scans += 1
         return True

@@ -13,14 +13,16 @@ _LANE_CHANGE = int(Manoeuvre.LANE_CHANGE)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def conclude_(bank: Any, mu: FloatArray, mean: FloatArray, cov: FloatArray, report: Any) -> None:
+def conclude_(
+    bank: Any, width: float, mu: FloatArray, mean: FloatArray, cov: FloatArray, report: Any
+) -> None:
     """Fill one report from mode probabilities and the combined estimate.
 
     A manoeuvre's probability is the sum over its modes; the direction of a lane change is that of
     its likelier modes; the lane is the nearer of the two.
 
     Args:
-        bank: record of `imm.BANK_DTYPE`.  mu: (M,).  mean: (n,).  cov: (n, n).
+        bank: record of `imm.BANK_DTYPE`.  width: of the object's lanes [m].  mu: (M,).  mean: (n,).  cov: (n, n).
     """
     for i in range(report.p.shape[0]):
         report.p[i] = 0.0
@@ -45,7 +47,7 @@ def conclude_(bank: Any, mu: FloatArray, mean: FloatArray, cov: FloatArray, repo
         report.direction = 1 if turn > 0.0 else -1
         if turn == 0.0:
             report.direction = 1 if mean[3] >= 0.0 else -1
-    report.lane = 1 if mean[2] > 0.5 * bank.lane_width else 0
+    report.lane = 1 if mean[2] > 0.5 * width else 0
     for s in range(4):
         report.x[s] = mean[s]
         for t in range(4):
@@ -73,7 +75,7 @@ def fill_reports_(
         report.object_id = ids[s]
         report.age = age[s]
         report.coasting = not measured[s]
-        conclude_(bank[0], obj.mu, obj.mean, obj.cov, report)
+        conclude_(bank[0], obj.lane_width, obj.mu, obj.mean, obj.cov, report)
         n += 1
     return n
 
@@ -108,6 +110,6 @@ def extrapolate_all_(
         report.object_id = ids[s]
         report.age = age[s]
         report.coasting = True
-        conclude_(bank[0], w.w, w.tx, w.tP, report)
+        conclude_(bank[0], objects[s].lane_width, w.w, w.tx, w.tP, report)
         n += 1
     return n

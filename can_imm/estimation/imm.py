@@ -258,7 +258,7 @@ def transitions_(bank: Any, obj: Any, work: Any, m: int) -> None:  # pragma: no 
                 base = reference(
                     bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, work.tx[s]
                 )
-                sd = math.sqrt(work.var[s])
+                sd = math.sqrt(max(work.var[s], bank.var_floor))
                 log_mass += truncated_normal(
                     (base + bank.bound_lower[j, c] - work.tx[s]) / sd,
                     (base + bank.bound_upper[j, c] - work.tx[s]) / sd,

@@ -6,6 +6,7 @@ import csv
 import io
 import re
 import time
+from pathlib import Path
 
 import pytest
 
@@ -17,6 +18,9 @@ COLUMNS = (
     "time_s,object_id,manoeuvre,probability,lane,direction,x,vx,y,vy,p_keep_right,p_lane_change,"
     "p_keep_left,p_overtaking,p_receding,p_approaching,p_rear_end"
 )
+
+
+REAL_LOG = Path(__file__).parents[3] / "shared/data/comma2k19/comma2k19_rav4_radar_tracks.log"
 
 
 def rows_of(text: str) -> list[dict[str, str]]:
@@ -171,3 +175,25 @@ def test_a_truncated_log_gives_what_it_holds(can_imm, log, tmp_path):
     assert status in (0, 1)
     assert "Traceback" not in err
     assert ("cut.blf" in out) or ("cut.blf" in err)
+
+
+@pytest.mark.skipif(not REAL_LOG.is_file(), reason="no recorded data beside the repository")
+def test_the_lane_change_on_a_real_road(can_imm, tmp_path):
+    """Track 0x212 moves over to the right between 5 and 10 s of the recording; its middle is 7.5 s."""
+    path = tmp_path / "reports.csv"
+    status, out, _ = can_imm("replay", REAL_LOG, "--profile", "toyota", "--csv", path)
+    assert status == 0
+    assert "38,400 read" in out
+    assert "19,200 right, 0 wrong" in out
+    began = 46408.587652
+    changes = [
+        [float(x) - began for x in line.split()[:2]]
+        for line in out.splitlines()
+        if line.split()[2:] == ["2", "right"]
+    ]
+    middle = [sum(change) / 2 for change in changes if 4.0 < change[0] < 11.0]
+    assert len(middle) == 1
+    assert middle[0] == pytest.approx(7.5, abs=1.0)
+    rows = [row for row in rows_of(path.read_text()) if row["object_id"] == "2"]
+    said = [row for row in rows if 5.5 < float(row["time_s"]) - began < 11.0]
+    assert {row["direction"] for row in said if row["manoeuvre"] == "LANE_CHANGE"} == {"right"}
