@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import can_imm
 from can_imm.bus.codec import Field, field, find_signal, load_dbc
-from can_imm.bus.errors import one_line
 from can_imm.bus.protection import KINDS, p01_data_id
+from can_imm.tables import Table, builtin_names, read_table
 from can_imm.types import CanImmError
 
 STATES = ("x", "vx", "y", "vy")
+_LARGEST = 1e6
+"""No time in milliseconds, noise or offset is larger."""
 
 
 @dataclass(frozen=True)
@@ -79,44 +80,7 @@ def dbc_dir() -> Path:
 
 def builtin_profiles() -> list[str]:
     """Names of the built-in profiles."""
-    return sorted(path.stem for path in dbc_dir().glob("*.toml"))
-
-
-class _Table:
-    """A TOML table that says where it is when something is wrong with it."""
-
-    def __init__(self, values: Any, path: Path, where: str) -> None:
-        self.path, self.where = path, where
-        if not isinstance(values, dict):
-            self.fail("must be a table")
-        self._values = dict(values)
-
-    def fail(self, text: str) -> Any:
-        raise CanImmError(f"{self.path}: {self.where + ': ' if self.where else ''}{text}")
-
-    def take(self, key: str, kind: type, default: Any = ...) -> Any:
-        if key not in self._values:
-            return self.fail(f"key {key!r} is missing") if default is ... else default
-        value = self._values.pop(key)
-        wanted = (int, float) if kind is float else (kind,)
-        if not isinstance(value, wanted) or isinstance(value, bool):
-            names = {str: "text", float: "a number", dict: "a table", list: "a list"}
-            self.fail(f"key {key!r} must be {names[kind]}, not {value!r}")
-        return value
-
-    def table(self, key: str) -> _Table:
-        return _Table(self.take(key, dict), self.path, f"{self.where} {key}".strip())
-
-    def milliseconds(self, key: str, *, least: float) -> int:
-        value = self.take(key, float)
-        # NaN must not pass either
-        if not least <= value < 1e6:
-            self.fail(f"key {key!r} must lie between {least:g} and 1e6, not {value:g}")
-        return round(float(value) * 1e6)
-
-    def close(self) -> None:
-        if self._values:
-            self.fail(f"unknown key {next(iter(self._values))!r}")
+    return builtin_names(dbc_dir())
 
 
 def load_profile(name_or_path: str) -> Profile:
@@ -125,58 +89,39 @@ def load_profile(name_or_path: str) -> Profile:
     Raises:
         CanImmError: file missing or broken, or a key, message or signal that is wrong.
     """
-    path = Path(name_or_path)
-    if path.suffix != ".toml" and len(path.parts) == 1:
-        if name_or_path not in builtin_profiles():
-            known = ", ".join(builtin_profiles())
-            raise CanImmError(f"no sensor profile {name_or_path!r} (built-in: {known}; or a .toml)")
-        path = dbc_dir() / f"{name_or_path}.toml"
-    try:
-        values = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise CanImmError(f"{path}: {one_line(error)}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CanImmError(f"{path}: not valid TOML: {one_line(error)}") from error
-    return _read(_Table(values, path, ""))
-
-
-def _read(top: _Table) -> Profile:
-    path = top.path
-    dbc = path.parent / top.take("dbc", str)
-    description = top.take("description", str, "")
+    top = read_table(name_or_path, dbc_dir(), "sensor profile")
+    path = Path(top.file)
+    dbc = path.parent / top.text("dbc")
+    description = top.text("description", "")
     scan, obj, protection = top.table("scan"), top.table("object"), top.table("protection")
-    top.close()
+    top.done()
     database = load_dbc(dbc)
 
-    period_ns = scan.milliseconds("period_ms", least=1)
-    timeout_ns = scan.milliseconds("timeout_ms", least=1)
-    latency_ns = scan.milliseconds("latency_ms", least=0)
-    counter = scan.take("counter", str)
+    period_ns = _milliseconds(scan, "period_ms", least=1)
+    timeout_ns = _milliseconds(scan, "timeout_ms", least=1)
+    latency_ns = _milliseconds(scan, "latency_ms", least=0)
+    counter = scan.text("counter")
     header = None
-    if (header_name := scan.take("header", str, None)) is not None:
-        header = Header(_message(scan, database, header_name, dbc), scan.take("count", str))
-    scan.close()
+    if "header" in scan:
+        header = Header(_message(scan, database, scan.text("header"), dbc), scan.text("count"))
+    scan.done()
 
     messages = _messages(obj, database, dbc)
-    id_signal, new_signal = obj.take("id", str, None), obj.take("new", str, None)
+    id_signal = obj.text("id") if "id" in obj else None
+    new_signal = obj.text("new") if "new" in obj else None
     if (header is None) != (id_signal is None):
-        obj.fail("key 'id' is needed with, and only with, a scan header")
-    valid_if = tuple(
-        _condition(_Table(entry, path, "object valid_if"))
-        for entry in obj.take("valid_if", list, [])
-    )
-    states = obj.table("state")
-    obj.close()
-    components = tuple(_component(states, name) for name in STATES)
-    states.close()
+        raise obj.error("'id' is needed with, and only with, a scan header")
+    valid_if = tuple(_condition(table) for table in obj.tables("valid_if", []))
+    state = obj.table("state")
+    obj.done()
+    components = tuple(_component(state.table(s)) if s in state else None for s in STATES)
+    state.done()
     if not any(components):
-        states.fail("no state is measured")
+        raise state.error("no state is measured")
 
-    kind = protection.take("kind", str)
-    if kind not in KINDS:
-        protection.fail(f"key 'kind' must be one of {', '.join(KINDS)}, not {kind!r}")
-    protection_counter = protection.take("counter", str) if kind == "toyota" else None
-    protection.close()
+    kind = protection.choice("kind", dict(zip(KINDS, KINDS, strict=True)))
+    protection_counter = protection.text("counter") if kind == "toyota" else None
+    protection.done()
 
     profile = Profile(
         path.stem, path, description, dbc, period_ns, timeout_ns, latency_ns, header, counter,
@@ -186,17 +131,21 @@ def _read(top: _Table) -> Profile:
     return profile
 
 
-def _message(table: _Table, database: Any, name: str, dbc: Path) -> Any:
+def _milliseconds(table: Table, key: str, *, least: float) -> int:
+    return round(table.number(key, low=least, high=_LARGEST) * 1e6)
+
+
+def _message(table: Table, database: Any, name: str, dbc: Path) -> Any:
     try:
         return database.get_message_by_name(name)
     except KeyError:
-        return table.fail(f"no message {name!r} in {dbc}")
+        raise table.error(f"no message {name!r} in {dbc}") from None
 
 
-def _messages(table: _Table, database: Any, dbc: Path) -> tuple[Any, ...]:
+def _messages(table: Table, database: Any, dbc: Path) -> tuple[Any, ...]:
     """The messages of a list of names and of id ranges such as "0x210-0x21F"."""
     messages: list[Any] = []
-    for entry in table.take("messages", list):
+    for entry in table.values("messages"):
         first, _, last = str(entry).partition("-")
         try:
             ids = range(int(first, 0), int(last or first, 0) + 1)
@@ -206,43 +155,35 @@ def _messages(table: _Table, database: Any, dbc: Path) -> tuple[Any, ...]:
         known = {message.frame_id: message for message in database.messages}
         for frame_id in ids[:4096]:
             if frame_id not in known:
-                table.fail(f"key 'messages': no message with id 0x{frame_id:X} in {dbc}")
+                raise table.error(f"'messages': no message with id 0x{frame_id:X} in {dbc}")
             messages.append(known[frame_id])
     if not messages or len({message.frame_id for message in messages}) < len(messages):
-        table.fail("key 'messages' must name at least one message, and none twice")
+        raise table.error("'messages' must name at least one message, and none twice")
     return tuple(messages)
 
 
-def _condition(table: _Table) -> Condition:
+def _condition(table: Table) -> Condition:
     condition = Condition(
-        table.take("signal", str),
-        table.take("equals", float, None),
-        table.take("below", float, None),
+        table.text("signal"),
+        table.number("equals") if "equals" in table else None,
+        table.number("below") if "below" in table else None,
     )
-    table.close()
+    table.done()
     if (condition.equals is None) == (condition.below is None):
-        table.fail("needs either 'equals' or 'below'")
+        raise table.error("needs either 'equals' or 'below'")
     return condition
 
 
-def _component(states: _Table, name: str) -> Component | None:
-    values = states.take(name, dict, None)
-    if values is None:
-        return None
-    table = _Table(values, states.path, f"{states.where} {name}")
+def _component(table: Table) -> Component:
     component = Component(
-        table.take("signal", str),
-        float(table.take("std", float)),
-        float(table.take("sign", float, 1)),
-        float(table.take("offset", float, 0)),
+        signal=table.text("signal"),
+        std=table.number("std", above=0.0, high=_LARGEST),
+        sign=table.number("sign", 1.0),
+        offset=table.number("offset", 0.0, low=-_LARGEST, high=_LARGEST),
     )
-    table.close()
-    if not 0 < component.std < 1e6:
-        table.fail(f"key 'std' must be a positive number, not {component.std:g}")
+    table.done()
     if component.sign not in (-1, 1):
-        table.fail(f"key 'sign' must be 1 or -1, not {component.sign:g}")
-    if not abs(component.offset) < 1e6:
-        table.fail(f"key 'offset' must be a finite number, not {component.offset:g}")
+        raise table.error(f"'sign' must be 1 or -1, not {component.sign:g}")
     return component
 
 

@@ -128,9 +128,17 @@ def change(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
     return apply
 
 
+EVEN = {"period_s": 0.1, "matrix": [[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]]}
+MANOEUVRE = (
+    "'manoeuvre' must be one of KEEP_RIGHT, LANE_CHANGE, KEEP_LEFT, OVERTAKING, RECEDING, "
+    "APPROACHING, REAR_END"
+)
+MODEL = "'model' must be one of constant-velocity, singer, equation-33"
+STATE = "'state' must be one of x, vx, y, vy, ax"
+
 REFUSALS = [
     ("name", None, "'name' is missing"),
-    ("name", 3, "'name' must be a string"),
+    ("name", 3, "'name' must be text"),
     ("states", ["x", "y"], "'states'"),
     ("states", "x", "'states'"),
     ("birth_std", [1.0, 1.0], "'birth_std'"),
@@ -153,18 +161,18 @@ REFUSALS = [
     ("lanes.right", [1, 0], "lanes: 'right'"),
     ("lanes.right", [0.0, 1.0], "lanes: 'right'"),
     ("lanes.right", [0, 10**400], "lanes: 'right'"),
-    ("lanes.left", None, "mode 'KEEP', soft[0]: no lane 'left'"),
+    ("lanes.left", None, "mode 'KEEP', soft 1: no lane 'left'"),
     ("mode", [], "no [[mode]]"),
-    ("mode", [3], "mode '#1'"),
+    ("mode", [3], "mode 1: must be a table, not 3"),
     ("mode.1.name", "KEEP", "same name"),
-    ("mode.1.name", ["KEEP"], "mode '#2': 'name' must be a string"),
-    ("mode.1.name", None, "mode '#2': 'name' is missing"),
-    ("mode.0.manoeuvre", "PARKING", "mode 'KEEP': unknown manoeuvre 'PARKING' (KEEP_RIGHT, "),
-    ("mode.0.manoeuvre", "UNKNOWN", "mode 'KEEP': unknown manoeuvre 'UNKNOWN'"),
+    ("mode.1.name", ["KEEP"], "mode 2: 'name' must be text"),
+    ("mode.1.name", None, "mode 2: 'name' is missing"),
+    ("mode.0.manoeuvre", "PARKING", f"mode 'KEEP': {MANOEUVRE}, not 'PARKING'"),
+    ("mode.0.manoeuvre", "UNKNOWN", f"mode 'KEEP': {MANOEUVRE}, not 'UNKNOWN'"),
     ("mode.1.direction", "up", "mode 'CHANGE': 'direction'"),
     ("mode.1.colour", "red", "mode 'CHANGE': unknown key 'colour'"),
     ("mode.0.x", None, "mode 'KEEP': 'x' is missing"),
-    ("mode.0.x.model", "jerk", "mode 'KEEP', x: unknown model 'jerk'"),
+    ("mode.0.x.model", "jerk", f"mode 'KEEP', x: {MODEL}, not 'jerk'"),
     ("mode.0.x.q", -1.0, "mode 'KEEP', x: 'q'"),
     ("mode.0.x.q", math.inf, "mode 'KEEP', x: 'q'"),
     ("mode.0.x.q", 1e300, "mode 'KEEP', x: 'q'"),
@@ -172,27 +180,27 @@ REFUSALS = [
     ("mode.0.y.model", "singer", "mode 'KEEP', y: model 'singer' needs"),
     ("mode.1.x.tau_s", 0.0, "mode 'CHANGE', x: 'tau_s'"),
     ("mode.1.x.acceleration_std", None, "mode 'CHANGE', x: 'acceleration_std' is missing"),
-    ("mode.0.soft.0.state", "z", "mode 'KEEP', soft[0]: unknown state 'z'"),
-    ("mode.0.soft.0.state", "ay", "mode 'KEEP', soft[0]: unknown state 'ay'"),
-    ("mode.0.soft.0.lane", "middle", "mode 'KEEP', soft[0]: no lane 'middle'"),
-    ("mode.0.soft.1.lane", "left", "mode 'KEEP', soft[1]: no lane 'left' for state 'vx'"),
-    ("mode.0.soft.0.r", -1.0, "mode 'KEEP', soft[0]: 'r'"),
-    ("mode.0.soft.0.r", 0.0, "mode 'KEEP', soft[0]: 'r'"),
-    ("mode.0.soft.1.value", None, "mode 'KEEP', soft[1]: 'value' is missing"),
-    ("mode.0.soft.1.value", math.nan, "mode 'KEEP', soft[1]: 'value'"),
+    ("mode.0.soft.0.state", "z", f"mode 'KEEP', soft 1: {STATE}, not 'z'"),
+    ("mode.0.soft.0.state", "ay", f"mode 'KEEP', soft 1: {STATE}, not 'ay'"),
+    ("mode.0.soft.0.lane", "middle", "mode 'KEEP', soft 1: no lane 'middle'"),
+    ("mode.0.soft.1.lane", "left", "mode 'KEEP', soft 2: no lane 'left' for state 'vx'"),
+    ("mode.0.soft.0.r", -1.0, "mode 'KEEP', soft 1: 'r'"),
+    ("mode.0.soft.0.r", 0.0, "mode 'KEEP', soft 1: 'r'"),
+    ("mode.0.soft.1.value", None, "mode 'KEEP', soft 2: 'value' is missing"),
+    ("mode.0.soft.1.value", math.nan, "mode 'KEEP', soft 2: 'value'"),
     ("mode.0.soft", {}, "mode 'KEEP': 'soft' must be a list"),
-    ("mode.0.soft", ["y"], "mode 'KEEP', soft[0]: a table is expected"),
+    ("mode.0.soft", ["y"], "mode 'KEEP', soft 1: must be a table, not 'y'"),
     ("mode.0.soft", [{"state": "y", "value": 0.0, "r": 1.0}] * 5, "'soft' has 5 rows, at most 4"),
-    ("mode.1.bounds.0.max", "low", "mode 'CHANGE', bounds[0]: 'max'"),
-    ("mode.1.bounds.0.min", 3.0, "mode 'CHANGE', bounds[0]: bounds are empty"),
-    ("mode.1.bounds.0.min", -0.25, "mode 'CHANGE', bounds[0]: bounds are empty"),
-    ("mode.1.bounds.0.min", math.nan, "mode 'CHANGE', bounds[0]: 'min'"),
-    ("mode.1.bounds.0.min", -(10**400), "mode 'CHANGE', bounds[0]: 'min'"),
-    ("mode.1.bounds.0.mass", 1, "mode 'CHANGE', bounds[0]: 'mass' must be a true or false"),
-    ("mode.1.entry.0.std", -0.1, "mode 'CHANGE', entry[0]: 'std'"),
-    ("mode.1.entry.0.std", 1e200, "mode 'CHANGE', entry[0]: 'std'"),
-    ("mode.1.entry.1.from", ["NOBODY"], "mode 'CHANGE', entry[1]: 'from' names the unknown"),
-    ("mode.1.entry.1.from", [[]], "mode 'CHANGE', entry[1]: 'from' names the unknown"),
+    ("mode.1.bounds.0.max", "low", "mode 'CHANGE', bounds 1: 'max'"),
+    ("mode.1.bounds.0.min", 3.0, "mode 'CHANGE', bounds 1: bounds are empty"),
+    ("mode.1.bounds.0.min", -0.25, "mode 'CHANGE', bounds 1: bounds are empty"),
+    ("mode.1.bounds.0.min", math.nan, "mode 'CHANGE', bounds 1: 'min'"),
+    ("mode.1.bounds.0.min", -(10**400), "mode 'CHANGE', bounds 1: 'min'"),
+    ("mode.1.bounds.0.mass", 1, "mode 'CHANGE', bounds 1: 'mass' must be true or false"),
+    ("mode.1.entry.0.std", -0.1, "mode 'CHANGE', entry 1: 'std'"),
+    ("mode.1.entry.0.std", 1e200, "mode 'CHANGE', entry 1: 'std'"),
+    ("mode.1.entry.1.from", ["NOBODY"], "mode 'CHANGE', entry 2: 'from' names the unknown"),
+    ("mode.1.entry.1.from", [[]], "mode 'CHANGE', entry 2: 'from' names the unknown"),
     ("mode.0.dwell_s", 0.0, "mode 'KEEP': 'dwell_s'"),
     ("mode.0.dwell_s", -2.0, "mode 'KEEP': 'dwell_s'"),
     ("mode.0.dwell_s", None, "mode 'KEEP': 'dwell_s' is missing"),
@@ -206,7 +214,7 @@ REFUSALS = [
     ("mode.0.next", {"PASS": 0.0}, "mode 'KEEP', next: no mode follows"),
     ("mode.2.soft", [], "mode 'PASS': a mode with particles takes no 'soft'"),
     ("mode.2.particles", None, "mode 'PASS': 'x' is missing"),
-    ("mode.2.particles", "yes", "mode 'PASS': 'particles' must be a true or false"),
+    ("mode.2.particles", "yes", "mode 'PASS': 'particles' must be true or false"),
     ("particles", None, "mode 'PASS': 'particles' needs a [particles] table"),
     ("particles.count", 3, "particles: 'count'"),
     ("particles.count", 50.0, "particles: 'count' must be a whole number"),
@@ -221,7 +229,8 @@ REFUSALS = [
     ("particles.window", ["a", "b"], "particles: 'window'"),
     ("particles.std_x", None, "particles: 'std_x' is missing"),
     ("particles.colour", "red", "particles: unknown key 'colour'"),
-    ("transition", {}, "mode 'KEEP': unknown key 'dwell_s'"),
+    ("transition", {}, "transition: 'matrix' is missing"),
+    ("transition", EVEN, "mode 'KEEP': unknown key 'dwell_s'"),
     ("transition", 3, "'transition' must be a table"),
 ]  # fmt: skip
 
@@ -271,7 +280,7 @@ def test_refusals_of_a_matrix(path: str, value: Any, message: str) -> None:
 
 
 def check_line(text: str, file: str = "some.toml") -> None:
-    assert text.startswith((f"{file}: ", f"{file}, "))
+    assert text.startswith(f"{file}: ")
     assert len(text.splitlines()) == 1
     assert len(text) < 400
 
@@ -318,13 +327,13 @@ def test_a_file_by_its_path(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "No such file"),
-        (b"name = ", "not a TOML file"),
-        (b"\xff\xfe\x00", "not a TOML file"),
-        (b"a = " + b"[" * 5000, "not a TOML file"),
-        (b"a = " + b"9" * 5000, "not a TOML file"),
+        (None, "neither a file nor a built-in preset (paper, two-lane)"),
+        (b"name = ", "not valid TOML"),
+        (b"\xff\xfe\x00", "cannot be read: not a text file in UTF-8"),
+        (b"a = " + b"[" * 5000, "not valid TOML"),
+        (b"a = " + b"9" * 5000, "not valid TOML"),
         (b"", "'name' is missing"),
-        (SMALL.replace("r = 0.3", "r = -0.3").encode(), "mode 'KEEP', soft[0]: 'r'"),
+        (SMALL.replace("r = 0.3", "r = -0.3").encode(), "mode 'KEEP', soft 1: 'r'"),
     ],
 )
 def test_refusals_of_a_file(tmp_path: Path, content: bytes | None, message: str) -> None:
@@ -339,12 +348,12 @@ def test_refusals_of_a_file(tmp_path: Path, content: bytes | None, message: str)
 def test_a_directory_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "folder.toml"
     path.mkdir()
-    with pytest.raises(CanImmError, match=r"folder\.toml: "):
+    with pytest.raises(CanImmError, match=r"folder\.toml: cannot be read: Is a directory"):
         load_bank(str(path))
 
 
 def test_an_unknown_preset_names_the_known_ones() -> None:
-    with pytest.raises(CanImmError, match=r"three-lane: no such preset \(paper, two-lane\)"):
+    with pytest.raises(CanImmError, match=r"three-lane: neither .* preset \(paper, two-lane\)"):
         load_bank("three-lane")
 
 

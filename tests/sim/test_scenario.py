@@ -9,6 +9,7 @@ from can_imm.sim.scenario import (
     Scenario,
     ScenarioObject,
     Segment,
+    Vehicle,
     builtin_scenarios,
     load_scenario,
 )
@@ -100,35 +101,39 @@ def test_the_built_in_ones_load_by_name() -> None:
 REFUSED = [
     # not TOML, or not the right tables and types
     ("duration = 40.0", "duration = 40.0.0", "not valid TOML: .* line 2"),
-    ("duration = 40.0", "", "duration is missing"),
-    ("duration = 40.0", "duration = '40'", "duration must be a number, not '40'"),
-    ("duration = 40.0", "duration = true", "duration must be a number, not True"),
+    ("duration = 40.0", "", "'duration' is missing"),
+    ("duration = 40.0", "duration = '40'", "'duration' must be a number, not '40'"),
+    ("duration = 40.0", "duration = true", "'duration' must be a number, not True"),
     ("duration = 40.0", "duration = 40.0\nlenght = 3", "unknown key 'lenght'"),
     ("[vehicle]", "[vehicle]\nmass = 3", "vehicle: unknown key 'mass'"),
-    ("[vehicle]", "[[vehicle]]", "vehicle: must be a table, not"),
-    ("id = 7", "id = 7.0", "object 1: id must be a whole number, not 7.0"),
-    ("id = 9", "", "object 2: id is missing"),
+    ("[vehicle]", "[[vehicle]]", "'vehicle' must be a table, not"),
+    ("id = 7", "id = 7.0", "object 1: 'id' must be a whole number, not 7.0"),
+    ("id = 9", "", "object 2: 'id' is missing"),
     ("id = 9", "id = 9\ncolour = 1", "object 2: unknown key 'colour'"),
     ("[[object]]\nid = 9", "[[objekt]]\nid = 9", "unknown key 'objekt'"),
-    ('lane = "left"', 'lane = "middle"', "object 2: lane must be one of right, left, not 'middle'"),
-    ('lane = "left"', "lane = 1", "object 2: lane must be one of right, left, not 1"),
+    (
+        'lane = "left"',
+        'lane = "middle"',
+        "object 2: 'lane' must be one of right, left, not 'middle'",
+    ),
+    ('lane = "left"', "lane = 1", "object 2: 'lane' must be one of right, left, not 1"),
     ('"KEEP_LEFT" }', '"KEEP_LEFT", peak_kmh = 2 }', "object 2, segment 1: unknown key 'peak_kmh'"),
     (
         '"KEEP_LEFT"',
         '"PARKING"',
-        "object 2, segment 1: label must be one of KEEP_RIGHT, .*'PARKING'",
+        "object 2, segment 1: 'label' must be one of KEEP_RIGHT, .*'PARKING'",
     ),
-    ('"KEEP_LEFT"', '"UNKNOWN"', "object 2, segment 1: label must be one of"),
-    ('direction = "left"', 'direction = "up"', "segment 3: direction must be one of left, right"),
-    (', direction = "left"', "", "object 1, segment 3: direction is missing"),
-    (", peak_kmh = 18.0", "", "object 2, segment 2: peak_kmh is missing"),
-    (", pull_out = 1.2", "", "object 1, segment 2: pull_out is missing"),
-    (", pull_in = 1.4", "", "object 1, segment 2: pull_in is missing"),
-    ("{ start = 0.0,", "{", "object 2, segment 1: start is missing"),
+    ('"KEEP_LEFT"', '"UNKNOWN"', "object 2, segment 1: 'label' must be one of"),
+    ('direction = "left"', 'direction = "up"', "segment 3: 'direction' must be one of left, right"),
+    (', direction = "left"', "", "object 1, segment 3: 'direction' is missing"),
+    (", peak_kmh = 18.0", "", "object 2, segment 2: 'peak_kmh' is missing"),
+    (", pull_out = 1.2", "", "object 1, segment 2: 'pull_out' is missing"),
+    (", pull_in = 1.4", "", "object 1, segment 2: 'pull_in' is missing"),
+    ("{ start = 0.0,", "{", "object 2, segment 1: 'start' is missing"),
     ('{ start = 0.0, label = "KEEP_LEFT" }', "3", "object 2, segment 1: must be a table, not 3"),
     # numbers that cannot be
     ("duration = 40.0", "duration = 0", "duration must lie between"),
-    ("duration = 40.0", "duration = nan", "duration must lie between .*, not nan"),
+    ("duration = 40.0", "duration = nan", "'duration' must be a number, not nan"),
     ("duration = 40.0", "duration = 1e9", "duration must lie between"),
     ("ego_speed_kmh = 90", "ego_speed_kmh = -5", "ego_speed_kmh must lie between .*, not -5"),
     ("lane_width = 3.5", "lane_width = 20", "lane_width must lie between"),
@@ -136,7 +141,11 @@ REFUSED = [
     ("wheelbase = 3.0", "wheelbase = 0", "vehicle: wheelbase must lie between"),
     ("stanley_gain = 2.0", "stanley_gain = inf", "vehicle: stanley_gain must lie between"),
     ("acceleration = 1.5", "acceleration = 0", "vehicle: acceleration must be above 0"),
-    ("acceleration = 1.5", "acceleration = nan", "vehicle: acceleration must be above 0"),
+    (
+        "acceleration = 1.5",
+        "acceleration = nan",
+        "vehicle: 'acceleration' must be a number, not nan",
+    ),
     ("id = 9", "id = 7", "object 2: id 7 is already taken"),
     ("id = 9", "id = 64", "object 2: id must lie between 0 and 63, not 64"),
     ("id = 9", "id = -1", "object 2: id must lie between"),
@@ -150,12 +159,12 @@ REFUSED = [
     ("peak_kmh = 9.0", "peak_kmh = inf", r"segment 4 \(RECEDING\): peak_kmh must lie between"),
     ("peak_kmh = 18.0", "peak_kmh = 91.0", "peak_kmh: 91 km/h slower than the ego is not forwards"),
     ("pull_out = 1.2", "pull_out = 0", "pull_out must be above 0 s, not 0"),
-    ("pull_in = 1.4", "pull_in = nan", "pull_in must be above 0 s, not nan"),
+    ("pull_in = 1.4", "pull_in = nan", "'pull_in' must be a number, not nan"),
     # a table that does not make a drive
     ("{ start = 0,", "{ start = 1,", "object 1, segment 1: start must be 0, not 1"),
     ("start = 8.0", "start = 4.0", r"segment 2 \(OVERTAKING\): start 4 s is not before .*3, 4 s"),
     ("start = 8.0", "start = 3.0", r"segment 2 \(OVERTAKING\): start 4 s is not before .*3, 3 s"),
-    ("start = 8.0", "start = nan", r"segment 2 \(OVERTAKING\): start 4 s is not before .*3, nan s"),
+    ("start = 8.0", "start = nan", "segment 3: 'start' must be a number, not nan"),
     (
         "duration = 40.0",
         "duration = 11.0",
@@ -172,7 +181,7 @@ REFUSED = [
     (
         "APPROACHING",
         "REAR_END",
-        "label must be one of KEEP_RIGHT.*an approach becomes REAR_END.*not 'REAR_END'",
+        "'label' must be one of KEEP_RIGHT.*an approach becomes REAR_END.*not 'REAR_END'",
     ),
 ]
 
@@ -197,7 +206,10 @@ def test_overtaking_starts_in_the_right_lane(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("objects", ["", "object = []", "object = 3"])
 def test_a_file_without_objects_is_refused(tmp_path: Path, objects: str) -> None:
-    with pytest.raises(CanImmError, match=r"mine\.toml: object"):
+    with pytest.raises(
+        CanImmError,
+        match=r"mine\.toml: '?object'?( is missing|: at least one| must be a list of tables)",
+    ):
         load(tmp_path, "duration = 10.0\n" + objects)
 
 
@@ -225,3 +237,29 @@ def test_what_is_not_text_is_refused(tmp_path: Path) -> None:
 def test_labels_that_are_not_driven_are_refused_from_code_too(label: Manoeuvre) -> None:
     with pytest.raises(CanImmError, match=rf"object 1, segment 1 \({label.name}\): label"):
         Scenario("mine", 10.0, (ScenarioObject(1, 50.0, RIGHT, (Segment(0.0, label),)),))
+
+
+NAN = float("nan")
+KEEP = Segment(0.0, Manoeuvre.KEEP_RIGHT)
+
+
+@pytest.mark.parametrize(
+    ("segments", "duration", "acceleration", "message"),
+    [
+        ((KEEP,), NAN, 2.0, "^duration must lie between .*, not nan"),
+        ((KEEP,), 10.0, NAN, "^vehicle: acceleration must be above 0"),
+        ((KEEP, Segment(NAN, Manoeuvre.KEEP_RIGHT)), 10.0, 2.0, "segment 1 .* is not before .*nan"),
+        (
+            (Segment(0.0, Manoeuvre.OVERTAKING, peak=2.0, pull_out=NAN, pull_in=1.0),),
+            10.0,
+            2.0,
+            "pull_out must be above 0 s, not nan",
+        ),
+    ],
+)
+def test_not_a_number_is_refused_from_code_too(
+    segments: tuple[Segment, ...], duration: float, acceleration: float, message: str
+) -> None:
+    vehicle = Vehicle(acceleration=acceleration)
+    with pytest.raises(CanImmError, match=message):
+        Scenario("mine", duration, (ScenarioObject(1, 50.0, RIGHT, segments),), vehicle=vehicle)
