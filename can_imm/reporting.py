@@ -22,7 +22,8 @@ def conclude_(
     its likelier modes; the lane is the nearer of the two.
 
     Args:
-        bank: record of `imm.BANK_DTYPE`.  width: of the object's lanes [m].  mu: (M,).  mean: (n,).  cov: (n, n).
+        bank: record of `imm.BANK_DTYPE`.  width: of the object's lanes [m].
+        mu: (M,).  mean: (n,).  cov: (n, n).
     """
     for i in range(report.p.shape[0]):
         report.p[i] = 0.0

@@ -105,8 +105,9 @@ REPORT_DTYPE = np.dtype(
 )
 """What the detector says of one object after a scan.
 
-``t_ns`` time for which it holds: that of the step which took the scan; ``age`` number of scans in which the object was seen; ``manoeuvre`` and
-``second`` are values of `Manoeuvre`; ``direction`` of a lane change: +1 left, -1 right, 0 none;
+``t_ns`` time for which it holds: that of the step which took the scan; ``age`` number of scans in
+which the object was seen; ``manoeuvre`` and ``second`` are values of `Manoeuvre`; ``direction`` of
+a lane change: +1 left, -1 right, 0 none;
 ``lane`` 0 right, 1 left; ``coasting`` the object was missed in this scan; ``x``, ``cov`` mean and
 covariance of (x, vx, y, vy); ``p`` probability by `Manoeuvre` value, summing to 1 (all 0 while
 UNKNOWN).

@@ -179,7 +179,7 @@ def test_a_truncated_log_gives_what_it_holds(can_imm, log, tmp_path):
 
 @pytest.mark.skipif(not REAL_LOG.is_file(), reason="no recorded data beside the repository")
 def test_the_lane_change_on_a_real_road(can_imm, tmp_path):
-    """Track 0x212 moves over to the right between 5 and 10 s of the recording; its middle is 7.5 s."""
+    """Track 0x212 moves over to the right between 5 and 10 s; the middle is at 7.5 s."""
     path = tmp_path / "reports.csv"
     status, out, _ = can_imm("replay", REAL_LOG, "--profile", "toyota", "--csv", path)
     assert status == 0
