@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import signal
+
 from hypothesis import settings
+
+# A shell starts its background jobs with SIGINT ignored, and programs that the tests start would
+# inherit that; a handler they do not.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The first example of many tests compiles kernels, so there is no deadline per example; the same
 # examples in every run, so that a red run is red again.
