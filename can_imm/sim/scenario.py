@@ -8,7 +8,7 @@ from __future__ import annotations
 import tomllib
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from can_imm.sim.model import (
     LEFT,
@@ -19,6 +19,7 @@ from can_imm.sim.model import (
     Segment,
     Vehicle,
 )
+from can_imm.sim.table import Table, read_text
 from can_imm.types import CanImmError, Manoeuvre
 
 __all__ = [
@@ -30,7 +31,6 @@ __all__ = [
     "load_scenario",
 ]
 
-_T = TypeVar("_T")
 _KMH = 3.6
 _LANES = {"right": RIGHT, "left": LEFT}
 _DIRECTIONS = {"left": +1, "right": -1}
@@ -57,7 +57,10 @@ def load_scenario(name_or_path: str) -> Scenario:
     if name_or_path in builtin_scenarios():
         text, name = (_FOLDER / f"{name_or_path}.toml").read_text("utf-8"), name_or_path
     else:
-        text, name = _read(name_or_path), Path(name_or_path).stem
+        text, name = (
+            read_text(name_or_path, "scenario", builtin_scenarios()),
+            Path(name_or_path).stem,
+        )
     try:
         return _scenario(name, tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
@@ -66,70 +69,8 @@ def load_scenario(name_or_path: str) -> Scenario:
         raise CanImmError(f"{name_or_path}: {error}") from error
 
 
-def _read(path: str) -> str:
-    try:
-        return Path(path).read_text("utf-8")
-    except FileNotFoundError:
-        raise CanImmError(
-            f"{path}: neither a file nor a built-in scenario ({', '.join(builtin_scenarios())})"
-        ) from None
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file in UTF-8"
-        raise CanImmError(f"{path}: cannot be read: {reason}") from error
-
-
-class _Table:
-    """A TOML table that is read key by key; what nobody asked for is an unknown key."""
-
-    def __init__(self, data: Any, where: str) -> None:
-        if not isinstance(data, dict):
-            raise CanImmError(f"{where.removesuffix(': ')}: must be a table, not {data!r}")
-        self._data = dict(data)
-        self._where = where
-
-    def _take(self, key: str, default: Any) -> Any:
-        if key not in self._data and default is None:
-            raise CanImmError(f"{self._where}{key} is missing")
-        return self._data.pop(key, default)
-
-    def _refuse(self, key: str, expected: str, value: Any) -> CanImmError:
-        return CanImmError(f"{self._where}{key} must be {expected}, not {value!r}")
-
-    def number(self, key: str, default: float | None = None) -> float:
-        value = self._take(key, default)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise self._refuse(key, "a number", value)
-        return float(value)
-
-    def integer(self, key: str) -> int:
-        value = self._take(key, None)
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise self._refuse(key, "a whole number", value)
-        return value
-
-    def choice(self, key: str, choices: dict[str, _T], hint: str = "") -> _T:
-        value = self._take(key, None)
-        if not isinstance(value, str) or value not in choices:
-            raise self._refuse(key, f"one of {', '.join(choices)}{hint}", value)
-        return choices[value]
-
-    def table(self, key: str) -> _Table:
-        return _Table(self._take(key, {}), f"{self._where}{key}: ")
-
-    def tables(self, key: str, item: str) -> list[_Table]:
-        value = self._take(key, None)
-        if not isinstance(value, list):
-            raise self._refuse(key, "an array of tables", value)
-        prefix = f"{self._where.removesuffix(': ')}, " if self._where else ""
-        return [_Table(v, f"{prefix}{item} {i}: ") for i, v in enumerate(value, start=1)]
-
-    def done(self) -> None:
-        if self._data:
-            raise CanImmError(f"{self._where}unknown key {min(self._data)!r}")
-
-
 def _scenario(name: str, data: dict[str, Any]) -> Scenario:
-    top = _Table(data, "")
+    top = Table(data, "")
     vehicle = top.table("vehicle")
     scenario_vehicle = Vehicle(
         wheelbase=vehicle.number("wheelbase", Vehicle.wheelbase),
@@ -148,7 +89,7 @@ def _scenario(name: str, data: dict[str, Any]) -> Scenario:
     return Scenario(name=name, objects=objects, vehicle=scenario_vehicle, **keywords)
 
 
-def _object(table: _Table) -> ScenarioObject:
+def _object(table: Table) -> ScenarioObject:
     target = ScenarioObject(
         id=table.integer("id"),
         gap=table.number("gap"),
@@ -159,7 +100,7 @@ def _object(table: _Table) -> ScenarioObject:
     return target
 
 
-def _segment(row: _Table) -> Segment:
+def _segment(row: Table) -> Segment:
     label = row.choice("label", _LABELS, " (an approach becomes REAR_END by its gap)")
     overtaking = label is Manoeuvre.OVERTAKING
     segment = Segment(
