@@ -1,4 +1,4 @@
-"""Trackers: detections of several sensors in, objects out, which the detector reads as a radar's."""
+"""Trackers: detections of several sensors in, objects out, for the detector like a radar's."""
 
 from __future__ import annotations
 
