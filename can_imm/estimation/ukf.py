@@ -16,7 +16,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from can_imm.types import VX, VY, FloatArray, IntArray, X, Y
+from can_imm.types import VX, VY, FloatArray, X, Y
 
 OMEGA = 4
 """Index of the turn rate [rad/s], positive to the left."""
@@ -57,10 +57,11 @@ PARAMETERS_DTYPE = np.dtype(
 )
 """Parameters of the filter.
 
-``Pi[m, i, j]`` is the probability of going from model i to j in m steps of ``step_s``.  ``q`` is the
-spectral density of the acceleration [m²/s³], ``q_omega`` that of the turn rate [rad²/s³], which
-decays to 0 at the rate ``decay`` [1/s].  Sigma points lie ``spread`` standard deviations out, with
-weights ``wm0`` (mean) and ``wc0`` (covariance) in the centre and ``wi`` for each of the others.
+``Pi[m, i, j]`` is the probability of going from model i to j in m steps of ``step_s``.  ``q`` is
+the spectral density of the acceleration [m²/s³], ``q_omega`` that of the turn rate's derivative
+[rad²/s³]; the turn rate decays to 0 at the rate ``decay`` [1/s].  Sigma points lie ``spread``
+standard deviations out, with weights ``wm0`` (mean) and ``wc0`` (covariance) in the centre and
+``wi`` for each of the others: `set_spread_`.
 """
 
 TRACK_DTYPE = np.dtype(
@@ -87,6 +88,19 @@ SCRATCH_DTYPE = np.dtype(
     align=True,
 )
 """Working memory of the kernels that does not depend on the number of lidars."""
+
+
+def set_spread_(par: Any, alpha: float = 1.0, beta: float = 0.0, kappa: float = 0.0) -> None:
+    """Choose the sigma points of a record of `PARAMETERS_DTYPE` (van der Merwe's scaled set).
+
+    The default is the cubature rule: no weight in the centre, none negative, so that the
+    covariances stay positive definite.
+    """
+    scale = alpha * alpha * (N + kappa)
+    par["spread"] = math.sqrt(scale)
+    par["wm0"] = 1.0 - N / scale
+    par["wc0"] = par["wm0"] + 1.0 - alpha * alpha + beta
+    par["wi"] = 0.5 / scale
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -146,7 +160,7 @@ def cholesky_(n: int, A: FloatArray, L: FloatArray) -> bool:  # pragma: no cover
 def sigma_points_(
     x: FloatArray, P: FloatArray, spread: float, points: FloatArray, L: FloatArray
 ) -> bool:  # pragma: no cover - compiled
-    """Sigma points (11, 5) of N(x, P): x, x + spread L[:, k], x - spread L[:, k]; False: no root."""
+    """Sigma points (11, 5) of N(x, P): x, x ± spread L[:, k]; False: P has no root L."""
     if not cholesky_(N, P, L):
         return False
     for i in range(N):

@@ -158,7 +158,7 @@ def play(scene: RoadsideScene, rng: np.random.Generator) -> RoadsideRun:
     end = min(scene.duration, scene.road.length / scene.speed)
     n = max(math.ceil(end / period - 1e-9), 1)
     t_ns = np.arange(n, dtype=np.int64) * scene.period_ns
-    way = scene.road.along(scene.speed * period * np.arange(n))
+    way = scene.road.along(scene.speed * period * np.arange(n, dtype=np.float64))
     state = np.stack(
         (
             way[:, 0],

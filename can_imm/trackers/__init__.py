@@ -40,7 +40,9 @@ class TrackerCounts:
 class Tracker(Protocol):
     """One call per step of the loop; survives whatever the sensors say."""
 
-    counts: TrackerCounts
+    @property
+    def counts(self) -> TrackerCounts:
+        """What became of everything so far."""
 
     def step(self, t_ns: int, detections: DetectionScan | None) -> Scan | None:
         """Take in the scan that came in the step at ``t_ns`` [ns], if any.
