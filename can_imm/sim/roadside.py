@@ -147,7 +147,7 @@ class RoadsideRun(SceneRun):
     visible: BoolArray
 
 
-def play(scene: RoadsideScene, rng: np.random.Generator) -> RoadsideRun:
+def play_scene(scene: RoadsideScene, rng: np.random.Generator) -> RoadsideRun:
     """Drive along the road and measure; all lidars at the same times, from t = 0 on.
 
     Every lidar is in every scan, also where it sees nothing.  A bearing may lie a little outside of
@@ -209,7 +209,12 @@ def _scan(
     return scan
 
 
-def load_roadside_scene(name_or_path: str = DEFAULT_SCENE) -> RoadsideScene:
+def builtin_scenes() -> list[str]:
+    """Names of the roadside scenes that come with the package."""
+    return [DEFAULT_SCENE]
+
+
+def load_scene(name_or_path: str = DEFAULT_SCENE) -> RoadsideScene:
     """Read the built-in scene or any other from a TOML file.
 
     Raises:
@@ -219,7 +224,7 @@ def load_roadside_scene(name_or_path: str = DEFAULT_SCENE) -> RoadsideScene:
     if name_or_path == DEFAULT_SCENE:
         text, name = (_FOLDER / f"{DEFAULT_SCENE}.toml").read_text("utf-8"), name_or_path
     else:
-        text, name = read_text(name_or_path, "scene", [DEFAULT_SCENE]), Path(name_or_path).stem
+        text, name = read_text(name_or_path, "scene", builtin_scenes()), Path(name_or_path).stem
     try:
         return _scene(name, tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
@@ -230,6 +235,7 @@ def load_roadside_scene(name_or_path: str = DEFAULT_SCENE) -> RoadsideScene:
 
 def _scene(name: str, data: dict[str, Any]) -> RoadsideScene:
     top = Table(data, "")
+    top.choice("kind", {"roadside": None})
     duration, period = top.number("duration"), top.number("period")
     _require(0.001 <= period <= 10.0, f"period must lie between 0.001 and 10 s, not {period:g}")
     miss_probability = top.number("miss_probability", 0.0)
