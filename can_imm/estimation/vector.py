@@ -18,20 +18,22 @@ _ROUND = 6755399441055744.0
 """1.5 * 2**52: adding it leaves the nearest integer in the low bits of a double."""
 
 
-@intrinsic
-def _as_float(typing_context: Any, bits: Any) -> Any:  # pragma: no cover - compiled
+def _to_float(typing_context: Any, bits: Any) -> Any:  # pragma: no cover - compiled
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.bitcast(args[0], ir.DoubleType())
 
     return types.float64(types.int64), generate
 
 
-@intrinsic
-def _as_int(typing_context: Any, value: Any) -> Any:  # pragma: no cover - compiled
+def _to_int(typing_context: Any, value: Any) -> Any:  # pragma: no cover - compiled
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.bitcast(args[0], ir.IntType(64))
 
     return types.int64(types.float64), generate
+
+
+_as_float: Any = intrinsic(_to_float)
+_as_int: Any = intrinsic(_to_int)
 
 
 @numba.njit(inline="always", error_model="numpy")
@@ -54,7 +56,8 @@ def fast_exp(x: float) -> float:  # pragma: no cover - compiled
     p = p * r + 0.5
     p = p * r + 1.0
     p = p * r + 1.0
-    return p * _as_float((_as_int(shifted) + 1023) << 52)
+    scale: float = _as_float((_as_int(shifted) + 1023) << 52)
+    return p * scale
 
 
 @numba.njit(inline="always", error_model="numpy")
@@ -64,9 +67,9 @@ def fast_log(x: float) -> float:  # pragma: no cover - compiled
     # split off the exponent such that the mantissa lies in [sqrt(1/2), sqrt(2))
     shifted = bits - 0x3FE6A09E667F3BCD
     exponent = shifted >> 52
-    m = _as_float(bits - (exponent << 52))
+    m: float = _as_float(bits - (exponent << 52))
     # an integer below 2**51 to a double without a conversion instruction
-    n = _as_float(exponent + 0x4338000000000000) - _ROUND
+    n: float = _as_float(exponent + 0x4338000000000000) - _ROUND
     t = (m - 1.0) / (m + 1.0)
     v = t * t
     p = 1.0 / 21.0

@@ -14,7 +14,8 @@ class TrackerCounts:
 
     Attributes:
         scans: scans that were used.
-        late_scans: scans that lay before one already used (as a repeated one does), and were not.
+        late_scans: scans of which no sensor's part could be used.
+        late_sensors: parts of a scan that lay before one already used, and were left out.
         repeated_sensors: parts of a scan that were left out, because the sensor sent the same
             counter twice.
         detections: detections that were used.
@@ -27,6 +28,7 @@ class TrackerCounts:
 
     scans: int = 0
     late_scans: int = 0
+    late_sensors: int = 0
     repeated_sensors: int = 0
     detections: int = 0
     invalid: int = 0
