@@ -30,7 +30,10 @@ OBJECT_ID = 1
 """The one object's id."""
 
 REPORT_ABOVE = 0.5
-"""The object is reported while its existence is more probable than this."""
+"""The object is reported while its existence is more probable than this ..."""
+
+CONFIRM = 4
+"""... from this scan in a row on: a detection says little of the speed across its direction."""
 
 FORGET_S = 2.0
 """After so long without a scan [s] everything begins anew."""
@@ -88,6 +91,7 @@ class CooperativeTracker:
         self._t_ns: int | None = None
         self._counter: dict[int, tuple[int, int]] = {}
         self._reported = False
+        self._probable = 0
         self._scans = 0
         self._scan = Scan(1)
         self._scan.ids[0] = OBJECT_ID
@@ -124,6 +128,7 @@ class CooperativeTracker:
             self.counts.resets += 1
             self.filter.forget()
             self._t_ns = self._ego_ns = None
+            self._probable = 0
             self._note(exists=False)
 
     def _usable_rows(self, t_ns: int, scan: DetectionScan) -> list[int]:
@@ -193,7 +198,8 @@ class CooperativeTracker:
         scan, f = self._scan, self.filter
         scan.t_ns = at_ns
         scan.counter = self._scans = (self._scans + 1) % 65536
-        exists = f.q > REPORT_ABOVE and self._ego_ns is not None
+        self._probable = self._probable + 1 if f.q > REPORT_ABOVE else 0
+        exists = self._probable >= CONFIRM and self._ego_ns is not None
         self._note(exists=exists)
         scan.n = int(exists)
         if not exists or self._ego_ns is None:
