@@ -43,7 +43,8 @@ PARAMETERS_DTYPE = np.dtype(
         ("mu0", np.float64, (_M,)),
         ("q", np.float64, (_M,)),
         ("q_omega", np.float64, (_M,)),
-        ("decay", np.float64, (_M,)),
+        ("entry_mean", np.float64, (_M,)),
+        ("entry_var", np.float64, (_M,)),
         ("mu_floor", np.float64),
         ("step_s", np.float64),
         ("spread", np.float64),
@@ -59,9 +60,10 @@ PARAMETERS_DTYPE = np.dtype(
 
 ``Pi[m, i, j]`` is the probability of going from model i to j in m steps of ``step_s``.  ``q`` is
 the spectral density of the acceleration [m²/s³], ``q_omega`` that of the turn rate's derivative
-[rad²/s³]; the turn rate decays to 0 at the rate ``decay`` [1/s].  Sigma points lie ``spread``
-standard deviations out, with weights ``wm0`` (mean) and ``wc0`` (covariance) in the centre and
-``wi`` for each of the others: `set_spread_`.
+[rad²/s³].  Whoever enters a model from another one gets a turn rate with ``entry_mean`` and
+``entry_var`` [rad/s, rad²/s²].  Sigma points lie ``spread`` standard deviations out, with weights
+``wm0`` (mean) and ``wc0`` (covariance) in the centre and ``wi`` for each of the others:
+`set_spread_`.
 """
 
 TRACK_DTYPE = np.dtype(
@@ -80,7 +82,10 @@ SCRATCH_DTYPE = np.dtype(
     [
         ("x", np.float64, (_M, N)),
         ("P", np.float64, (_M, N, N)),
+        ("from_x", np.float64, (_M, N)),
+        ("from_P", np.float64, (_M, N, N)),
         ("w", np.float64, (_M,)),
+        ("prior", np.float64, (_M,)),
         ("log_l", np.float64, (_M,)),
         ("points", np.float64, (N_POINTS, N)),
         ("L", np.float64, (N, N)),
@@ -178,15 +183,12 @@ def predict_(
 ) -> bool:  # pragma: no cover - compiled
     """Unscented time update of model j by ``dt`` seconds, in place; False if P has no root.
 
-    Noise: white acceleration in both axes; omega is a random walk, or where ``decay`` is not 0 an
-    Ornstein-Uhlenbeck process around 0.
+    Noise: white acceleration in both axes, and a random walk of omega.
     """
     if not sigma_points_(x, P, par.spread, points, L):
         return False
-    phi = math.exp(-par.decay[j] * dt)
     for k in range(N_POINTS):
         move_(par.kind[j], points[k], dt)
-        points[k, OMEGA] *= phi
     for i in range(N):
         s = par.wm0 * points[0, i]
         for k in range(1, N_POINTS):
@@ -205,10 +207,7 @@ def predict_(
         P[i, i + 1] += q * dt * dt / 2.0
         P[i + 1, i] += q * dt * dt / 2.0
         P[i + 1, i + 1] += q * dt
-    seconds = dt
-    if par.decay[j] > 0.0:
-        seconds = -math.expm1(-2.0 * par.decay[j] * dt) / (2.0 * par.decay[j])
-    P[OMEGA, OMEGA] += par.q_omega[j] * seconds
+    P[OMEGA, OMEGA] += par.q_omega[j] * dt
     return True
 
 
@@ -376,28 +375,6 @@ def correct_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def interact_(par: Any, track: Any, work: Any, m: int) -> None:  # pragma: no cover - compiled
-    """Mixing over m steps: every model begins from what all models say, weighted by Pi.
-
-    Mixed moments go back into ``track.x``, ``track.P``; ``track.mu`` becomes the prediction.
-    """
-    n_models = par.n_models
-    for j in range(n_models):
-        c = 0.0
-        for i in range(n_models):
-            work.w[i] = par.Pi[m, i, j] * track.mu[i]
-            c += work.w[i]
-        work.log_l[j] = c
-        mixture_(n_models, work.w, c, track.x, track.P, work.x[j], work.P[j])
-    for j in range(n_models):
-        track.mu[j] = work.log_l[j]
-        for a in range(N):
-            track.x[j, a] = work.x[j, a]
-            for b in range(N):
-                track.P[j, a, b] = work.P[j, a, b]
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
 def mixture_(
     n_models: int,
     w: FloatArray,
@@ -420,6 +397,38 @@ def mixture_(
                 s += w[i] * (Ps[i, a, b] + (xs[i, a] - x[a]) * (xs[i, b] - x[b]))
             P[a, b] = s / total
             P[b, a] = s / total
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def interact_(par: Any, track: Any, work: Any, m: int) -> None:  # pragma: no cover - compiled
+    """Mixing over m steps: every model begins from what all models say, weighted by Pi.
+
+    Who changes the model gets the turn rate of those who enter it.  The mixed moments go back into
+    ``track.x``, ``track.P``; ``track.mu`` becomes the prediction.
+    """
+    n_models = par.n_models
+    for j in range(n_models):
+        c = 0.0
+        for i in range(n_models):
+            work.w[i] = par.Pi[m, i, j] * track.mu[i]
+            c += work.w[i]
+            enters = i != j
+            for a in range(N):
+                work.from_x[i, a] = track.x[i, a]
+                for b in range(N):
+                    replaced = enters and (a == OMEGA or b == OMEGA)
+                    work.from_P[i, a, b] = 0.0 if replaced else track.P[i, a, b]
+            if enters:
+                work.from_x[i, OMEGA] = par.entry_mean[j]
+                work.from_P[i, OMEGA, OMEGA] = par.entry_var[j]
+        work.prior[j] = c
+        mixture_(n_models, work.w, c, work.from_x, work.from_P, work.x[j], work.P[j])
+    for j in range(n_models):
+        track.mu[j] = work.prior[j]
+        for a in range(N):
+            track.x[j, a] = work.x[j, a]
+            for b in range(N):
+                track.P[j, a, b] = work.P[j, a, b]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -506,9 +515,9 @@ def update_(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def begin_(
-    par: Any, track: Any, place: FloatArray, z: FloatArray, r: FloatArray, var: FloatArray
+    par: Any, track: Any, place: FloatArray, z: FloatArray, r: FloatArray, speed_var: float
 ) -> None:  # pragma: no cover - compiled
-    """Begin a track at one detection: position from it, velocity and turn rate 0.
+    """Begin a track at one detection: position from it, velocity 0, the models' entry turn rates.
 
     Position covariance: across the ray the bearing's noise as an arc, along it the range's noise
     and the arc's sagitta.
@@ -517,7 +526,7 @@ def begin_(
         par: parameters.  track: record of `TRACK_DTYPE`.
         place: (>= 2,) where the lidar stands [m].
         z: (2,) range [m] and bearing [rad].  r: (2,) their variances.
-        var: (2,) variances of each component of the velocity [m²/s²] and of omega [rad²/s²].
+        speed_var: variance of each component of the velocity [m²/s²].
     """
     c, s = math.cos(z[1]), math.sin(z[1])
     across = z[0] * z[0] * r[1]
@@ -534,7 +543,8 @@ def begin_(
         track.P[j, Y, Y] = along * s * s + across * c * c
         track.P[j, X, Y] = (along - across) * c * s
         track.P[j, Y, X] = track.P[j, X, Y]
-        track.P[j, VX, VX] = var[0]
-        track.P[j, VY, VY] = var[0]
-        track.P[j, OMEGA, OMEGA] = var[1]
+        track.P[j, VX, VX] = speed_var
+        track.P[j, VY, VY] = speed_var
+        track.x[j, OMEGA] = par.entry_mean[j]
+        track.P[j, OMEGA, OMEGA] = par.entry_var[j]
     mixture_(par.n_models, track.mu, 1.0, track.x, track.P, track.mean, track.cov)

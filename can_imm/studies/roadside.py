@@ -35,12 +35,15 @@ PUBLISHED = {"cv": (11.62, 14.87), "imm": (1.53, 3.18), "reduction": (0.868, 0.7
 """Position [m] and speed [m/s]; the paper doesn't say which of the two speed errors it means."""
 
 
-def _cv(q: float) -> RoadsideSettings:
+def cv(q: float) -> RoadsideSettings:
+    """A tracker with one constant-velocity model of noise density q [m²/s³]."""
     # one model: nothing turns, so the noise of the turn rate has no effect
-    return replace(IMM_UKF, models=(Motion(ukf.CV, q, 1e-4),), transitions=((1.0,),), birth=(1.0,))
+    return replace(
+        IMM_UKF, models=(Motion(ukf.CV, q, 1e-4, (0.0, 0.01)),), transitions=((1.0,),), birth=(1.0,)
+    )
 
 
-SYSTEMS = {"cv-strawman": _cv(1e-4), "cv-tuned": _cv(3.0), "imm-ukf": IMM_UKF}
+SYSTEMS = {"cv-strawman": cv(1e-4), "cv-tuned": cv(3.0), "imm-ukf": IMM_UKF}
 """Tuned, where tuned, by ``can-imm study tune-roadside`` on seeds below 1000."""
 
 
@@ -228,11 +231,7 @@ def _result(result: Result, values: dict[str, dict[str, FloatArray]]) -> dict[st
 def _setting(settings: RoadsideSettings) -> dict[str, Any]:
     names = {ukf.CV: "cv", ukf.CT: "ct"}
     models: Sequence[dict[str, Any]] = [
-        {
-            key: names[value] if key == "kind" else _known(value)
-            for key, value in asdict(model).items()
-        }
-        for model in settings.models
+        {**asdict(model), "kind": names[model.kind]} for model in settings.models
     ]
     return {
         "models": models,

@@ -39,8 +39,7 @@ _MAX_RANGE = 1000.0
 """What lies beyond is not a measurement [s, m]."""
 _MU_FLOOR = 1e-6
 _BIRTH_SPEED = 15.0
-_BIRTH_TURN_RATE = 0.3
-"""Standard deviations at a track's birth: of each component of the velocity [m/s]; [rad/s]."""
+"""Standard deviation of each component of the velocity at a track's birth [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +50,13 @@ class Motion:
         kind: `ukf.CV` or `ukf.CT`.
         q: spectral density of the acceleration [m²/s³].
         q_turn: spectral density of the turn rate's derivative [rad²/s³].
-        turn_memory: time constant with which the turn rate goes back to 0 [s]; infinite: never.
+        turn: mean and standard deviation of the turn rate of who begins to move like this [rad/s].
     """
 
     kind: int
     q: float
     q_turn: float
-    turn_memory: float = math.inf
+    turn: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -94,13 +93,18 @@ class RoadsideSettings:
 
 IMM_UKF = RoadsideSettings(
     models=(
-        Motion(ukf.CV, q=0.002, q_turn=0.1, turn_memory=20.0),
-        Motion(ukf.CT, q=0.002, q_turn=0.1, turn_memory=2.0),
+        Motion(ukf.CV, q=0.003, q_turn=1e-4, turn=(0.0, 0.01)),
+        Motion(ukf.CT, q=0.003, q_turn=0.001, turn=(0.55, 0.15)),
+        Motion(ukf.CT, q=0.003, q_turn=0.001, turn=(-0.55, 0.15)),
     ),
-    transitions=((0.985, 0.015), (0.006, 0.994)),
-    birth=(0.9, 0.1),
+    transitions=((0.983, 0.0085, 0.0085), (0.0045, 0.995, 0.0005), (0.0045, 0.0005, 0.995)),
+    birth=(0.9, 0.05, 0.05),
 )
-"""Default: tuned on seeds below 1000 of the published scene, see `can_imm.studies.roadside`."""
+"""Straight on, a bend to the left, a bend to the right; tuned by ``can-imm study tune-roadside``.
+
+Two models of turns instead of one around 0 have two advantages: a turn rate near 0 is not a turn,
+so that a straight can be told from a bend at all, and a bend is recognised earlier.
+"""
 
 
 @dataclass
@@ -165,7 +169,6 @@ class RoadsideTracker:
         self._mean: FloatArray = np.zeros(2 * capacity)
         self._S: FloatArray = np.zeros((2 * sensors, 2 * sensors))
         self._C: FloatArray = np.zeros((ukf.N, 2 * sensors))
-        self._birth_var = np.array([_BIRTH_SPEED**2, _BIRTH_TURN_RATE**2])
         self._sensors, self._capacity = sensors, capacity
         self._reset()
         self._warm_up()
@@ -304,7 +307,7 @@ class RoadsideTracker:
             self._places[k],
             self._z[k],
             self._r[k],
-            self._birth_var,
+            _BIRTH_SPEED**2,
         )
         self.alive = self._new = True
         self.counts.detections += 1
@@ -376,8 +379,10 @@ def _parameters(settings: RoadsideSettings) -> Any:
     if not 1 <= n <= ukf.MAX_MODELS:
         raise CanImmError(f"roadside tracker: 1 to {ukf.MAX_MODELS} models are possible, not {n}")
     for model in settings.models:
-        if not (model.q > 0.0 and model.q_turn > 0.0 and model.turn_memory > 0.0):
-            raise CanImmError("roadside tracker: q, q_turn and turn_memory must be above 0")
+        if not (model.q > 0.0 and model.q_turn > 0.0 and model.turn[1] > 0.0):
+            raise CanImmError(
+                "roadside tracker: q, q_turn and the turn's deviation must be above 0"
+            )
     if not (settings.range_std > 0.0 and settings.bearing_std > 0.0 and settings.gate > 0.0):
         raise CanImmError("roadside tracker: range_std, bearing_std and gate must be above 0")
     Pi = np.array(settings.transitions)
@@ -391,7 +396,8 @@ def _parameters(settings: RoadsideSettings) -> Any:
     par["kind"][:n] = [model.kind for model in settings.models]
     par["q"][:n] = [model.q for model in settings.models]
     par["q_omega"][:n] = [model.q_turn for model in settings.models]
-    par["decay"][:n] = [1.0 / model.turn_memory for model in settings.models]
+    par["entry_mean"][:n] = [model.turn[0] for model in settings.models]
+    par["entry_var"][:n] = [model.turn[1] ** 2 for model in settings.models]
     par["mu0"][:n] = birth
     par["mu_floor"] = _MU_FLOOR
     par["step_s"] = _STEP_S
