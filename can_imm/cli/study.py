@@ -3,6 +3,7 @@
   can-imm study paper                          table for the published scenario and random ones
   can-imm study paper --json out.json --plots figures
   can-imm study tune-rules                     how the baselines' constants were found
+  can-imm study bernoulli                      cooperative radars: errors over the parameters
   can-imm study roadside                       lidars beside the road: IMM-UKF and single models
   can-imm study tune-roadside                  how their constants were found
 
@@ -17,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from can_imm.cli import study_roadside
+from can_imm.cli import study_bernoulli, study_roadside
 from can_imm.cli.study_common import (
     add_jobs,
     cell,
@@ -85,6 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     tune.set_defaults(study_run=_tune)
 
+    study_bernoulli.add_arguments(studies)
     study_roadside.add_arguments(studies)
 
 
