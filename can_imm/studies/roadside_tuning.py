@@ -19,15 +19,15 @@ from can_imm.studies.runs import FIRST_SEED
 from can_imm.trackers.roadside import IMM_UKF, Motion, RoadsideSettings
 from can_imm.types import FloatArray
 
-LEAST_Q = 0.003
-"""Floor of the acceleration's spectral density [m²/s³]: 0.05 m/s² in a second."""
+LEAST_Q = 0.001
+"""Floor of the acceleration's spectral density [m²/s³]: 0.03 m/s² in a second."""
 LEAST_Q_TURN = 0.001
 """Floor of the turn rate's [rad²/s³]: 0.03 rad/s in a second."""
 LEAST_TURN_STD = 0.15
 """Floor of the spread of turn rates [rad/s]: not only the bend of this scene is one."""
 
 _DENSITIES = (0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
-_TRIES = 300
+_TRIES = 150
 _SPREAD = 0.4
 """Standard deviation of a step of the search, of the logarithms."""
 

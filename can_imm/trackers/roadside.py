@@ -93,11 +93,11 @@ class RoadsideSettings:
 
 IMM_UKF = RoadsideSettings(
     models=(
-        Motion(ukf.CV, q=0.003, q_turn=1e-4, turn=(0.0, 0.01)),
-        Motion(ukf.CT, q=0.003, q_turn=0.001, turn=(0.55, 0.15)),
-        Motion(ukf.CT, q=0.003, q_turn=0.001, turn=(-0.55, 0.15)),
+        Motion(ukf.CV, q=0.001, q_turn=1e-4, turn=(0.0, 0.01)),
+        Motion(ukf.CT, q=0.001, q_turn=0.001, turn=(0.5, 0.15)),
+        Motion(ukf.CT, q=0.001, q_turn=0.001, turn=(-0.5, 0.15)),
     ),
-    transitions=((0.983, 0.0085, 0.0085), (0.0045, 0.995, 0.0005), (0.0045, 0.0005, 0.995)),
+    transitions=((0.98, 0.01, 0.01), (0.002, 0.9979, 0.0001), (0.002, 0.0001, 0.9979)),
     birth=(0.9, 0.05, 0.05),
 )
 """Straight on, a bend to the left, a bend to the right; tuned by ``can-imm study tune-roadside``.
