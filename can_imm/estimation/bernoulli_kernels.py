@@ -385,7 +385,7 @@ def step_(
         # of all densities the same number, up to rounding that falls on each of them equally often
         u = rng.random()
         for m in range(n_births):
-            count = int((m + 1 + u) * born / n_births) - int((m + u) * born / n_births)
+            count = int((m + 1) * born / n_births + u) - int(m * born / n_births + u)
             if count and used + count <= cloud.shape[1]:
                 age = dt + birth_age[m]
                 draw_births_(
@@ -399,6 +399,8 @@ def step_(
     if not math.isfinite(log_l):
         return LOST, 0.0
     moments_(cloud, used, log_weight, mean, cov)
+    if not math.isfinite(mean[0] + mean[1] + mean[2] + mean[3]):
+        return LOST, 0.0
     resample_(cloud, used, log_weight, particles, rng.random())
     # 1 - Δ is the mean of ψ, l; q+ = l q- / (1 - q- + l q-)
     odds = math.log(predicted) + log_l
