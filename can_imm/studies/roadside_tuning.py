@@ -44,8 +44,8 @@ class Tuning:
 
 
 def numbers(settings: RoadsideSettings) -> FloatArray:
-    """The eight numbers of an IMM of one straight and two mirrored turns (8,)."""
-    straight, left, _ = settings.models
+    """The eight numbers (8,) of the straight and the mirrored turns; the last model is fixed."""
+    straight, left = settings.models[:2]
     Pi = settings.transitions
     return np.array(
         [straight.q, left.q, left.q_turn, *left.turn, Pi[0][1], Pi[1][0], Pi[1][2]], np.float64
@@ -58,18 +58,21 @@ def settings(values: FloatArray) -> RoadsideSettings:
     q, q_bend = max(q, LEAST_Q), max(q_bend, LEAST_Q)
     q_turn, std = max(q_turn, LEAST_Q_TURN), max(std, LEAST_TURN_STD)
     enter, leave, change = min(enter, 0.1), min(leave, 0.2), min(change, 0.01)
-    stay = round(1.0 - leave - change, 9)
+    free = IMM_UKF.transitions[0][3]
+    stay = round(1.0 - leave - change - free, 9)
     return replace(
         IMM_UKF,
         models=(
             Motion(ukf.CV, q, 1e-4, (0.0, 0.01)),
             Motion(ukf.CT, q_bend, q_turn, (turn, std)),
             Motion(ukf.CT, q_bend, q_turn, (-turn, std)),
+            IMM_UKF.models[3],
         ),
         transitions=(
-            (round(1.0 - 2.0 * enter, 9), enter, enter),
-            (leave, stay, change),
-            (leave, change, stay),
+            (round(1.0 - 2.0 * enter - free, 9), enter, enter, free),
+            (leave, stay, change, free),
+            (leave, change, stay, free),
+            IMM_UKF.transitions[3],
         ),
     )
 

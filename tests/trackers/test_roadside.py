@@ -127,6 +127,28 @@ def test_turns_are_told_from_straights():
         assert tracker.track["mean"][ukf.OMEGA] == pytest.approx(side * 0.5, abs=0.1)
 
 
+def test_a_vehicle_that_brakes_is_not_lost(tracker):
+    road, errors = Road(noise=1.0), []
+    for k in range(100):
+        scan = road.scan()
+        t = k * 0.05
+        braking = min(max(t - 2.0, 0.0), 2.5)
+        way = SPEED * t - 1.5 * braking**2 - 7.5 * max(t - 4.5, 0.0)
+        for row, (x, y, _) in enumerate(PLACES.values()):
+            scan.z[row, 0] += math.hypot(10.0 + way - x, y) - math.hypot(
+                position(scan.t_ns)[0] - x, y
+            )
+            old = math.atan2(-y, position(scan.t_ns)[0] - x)
+            scan.z[row, 1] += math.atan2(-y, 10.0 + way - x) - old
+        said = tracker.step(scan.t_ns, scan)
+        if k >= 30:
+            errors.append((said.z[0, 0] - 10.0 - way, said.z[0, 1] - SPEED + 3.0 * braking))
+    position_error, speed_error = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert position_error < 0.4  # three times that without the free model
+    assert speed_error < 0.8
+    assert (tracker.counts.outliers, tracker.counts.deaths) == (0, 0)
+
+
 def test_without_a_scan_nothing_is_said_and_with_an_empty_one_the_track_moves_on(tracker):
     road = Road()
     drive(tracker, road, 40)
@@ -347,12 +369,12 @@ def test_survives_any_numbers(rows):
     ("change", "message"),
     [
         ({"models": ()}, "models"),
-        ({"models": (Motion(ukf.CV, 0.0, 1.0, (0.0, 1.0)),) * 3}, "q"),
-        ({"models": (Motion(ukf.CV, 1.0, 1.0, (0.0, 0.0)),) * 3}, "turn"),
+        ({"models": (Motion(ukf.CV, 0.0, 1.0, (0.0, 1.0)),) * 4}, "q"),
+        ({"models": (Motion(ukf.CV, 1.0, 1.0, (0.0, 0.0)),) * 4}, "turn"),
         ({"transitions": ((1.0,),)}, "transitions"),
-        ({"transitions": ((0.5, 0.5, 0.1),) * 3}, "sum to 1"),
+        ({"transitions": ((0.5, 0.5, 0.1, 0.0),) * 4}, "sum to 1"),
         ({"birth": (0.5, 0.5)}, "birth"),
-        ({"birth": (0.5, 0.6, 0.1)}, "birth"),
+        ({"birth": (0.5, 0.6, 0.1, 0.1)}, "birth"),
         ({"range_std": 0.0}, "range_std"),
         ({"gate": math.nan}, "gate"),
     ],
