@@ -1,9 +1,9 @@
 """The Bernoulli filter's parameter study (Törő, Bécsi and Aradi 2018, section 4) by Monte Carlo.
 
 Four sweeps, one parameter at a time: time between scans, particles, and the factors k_s and k_m of
-the covariances of measurement and process.  k_s is the sensors' true noise, too.  Every run is
-judged from the first estimate on.  Run k of a setting uses seed ``seed + k``; with equal T_s and
-k_s settings see the same detections, and so do all systems.
+the covariances of measurement and process.  k_s is the sensors' true noise, too.  The first second
+is not judged: at the first detections little is known of the speed.  Run k of a setting uses seed
+``seed + k``; with equal T_s and k_s settings see the same detections, and so do all systems.
 """
 
 from __future__ import annotations
@@ -55,6 +55,9 @@ EXISTENCE: dict[str, Any] = {"p_detection": 0.9, "clutter": 5.0}
 
 PRESENT, ABSENT = 0.99, 0.1
 """The object is found, and lost, when q passes these."""
+
+SETTLE_S = 1.0
+"""From this time on a run is judged [s]."""
 
 BINS = 50
 """Of the paper's histograms."""
@@ -142,10 +145,11 @@ def _distance(scene: CooperativeScene, run: SceneRun, x: FloatArray) -> FloatArr
     return error
 
 
-def _errors_of(error: FloatArray, judged: Any) -> list[float | None]:
+def _errors_of(run: SceneRun, error: FloatArray, known: Any) -> list[float | None]:
     """Standard deviation about the mean, RMS, and share of the scans without an estimate."""
-    missing = 1.0 - float(judged[1:].mean())
-    error = error[judged]
+    judged = run.t_ns >= round(SETTLE_S * 1e9)
+    missing = 1.0 - float(known[judged].mean())
+    error = error[judged & known]
     if not len(error):
         return [None, None, missing]
     return [float(error.std()), float(np.sqrt(np.mean(error**2))), missing]
@@ -162,9 +166,9 @@ def errors_job(key: str) -> dict[str, list[float | None]]:
     for system in (PRODUCT, UNION):
         mine = replace(model, union=system == UNION)
         x, q = follow(run, mine, setting.particles, seed)
-        results[system] = _errors_of(_distance(scene, run, x), q > 0.5)
+        results[system] = _errors_of(run, _distance(scene, run, x), q > 0.5)
     x = follow_ekf(run, model)
-    results[EKF] = _errors_of(_distance(scene, run, x), np.isfinite(x[:, X]))
+    results[EKF] = _errors_of(run, _distance(scene, run, x), np.isfinite(x[:, X]))
     return results
 
 
@@ -253,7 +257,7 @@ def job(key: str) -> Any:
 
 
 def _key(setting: Setting, seed: int) -> str:
-    return json.dumps({"setting": asdict(setting), "seed": seed})
+    return json.dumps({"setting": asdict(setting), "settle_s": SETTLE_S, "seed": seed})
 
 
 def _keys(
