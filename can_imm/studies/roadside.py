@@ -44,7 +44,7 @@ def cv(q: float) -> RoadsideSettings:
 
 
 SYSTEMS = {"cv-strawman": cv(1e-4), "cv-tuned": cv(3.0), "imm-ukf": IMM_UKF}
-"""Tuned, where tuned, by ``can-imm study tune-roadside`` on seeds below 1000."""
+"""Tuned, where tuned, on seeds below 1000: `can_imm.studies.roadside_tuning`."""
 
 
 @dataclass(frozen=True)

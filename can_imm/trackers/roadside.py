@@ -111,7 +111,7 @@ IMM_UKF = RoadsideSettings(
 Two models of turns instead of one around 0: a turn rate near 0 is not a turn, so that a straight
 can be told from a bend.  The last model is a constant velocity with so much noise that a vehicle
 which brakes or speeds up is not lost; on a road without that it costs a tenth of the accuracy.
-The first three models' numbers are tuned by ``can-imm study tune-roadside``.
+The first three models' numbers were found as ``can-imm study tune-roadside`` does, and rounded.
 """
 
 

@@ -341,7 +341,7 @@ def test_what_there_is_no_room_for_is_counted():
 number = st.floats(allow_nan=True, allow_infinity=True, width=64)
 
 
-@settings(max_examples=60)
+@settings(max_examples=20)
 @given(st.lists(st.tuples(number, number, number, number, st.integers(0, 3)), max_size=25))
 def test_survives_any_numbers(rows):
     tracker, road = RoadsideTracker(), Road()
