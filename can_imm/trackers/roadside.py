@@ -123,12 +123,10 @@ class RoadsideCounts(TrackerCounts):
         outliers: detections too far from anything the vehicle could do.
         extra: detections beside one that was used: of the same lidar in one scan, where the
             likeliest is used, and at a track's birth, where the nearest is.
-        late_sensors: parts of a scan that lay before what was already used, and were not.
     """
 
     outliers: int = 0
     extra: int = 0
-    late_sensors: int = 0
 
 
 class RoadsideTracker:
