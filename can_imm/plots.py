@@ -1,8 +1,8 @@
 """Figures 3 to 8 of the paper and the study's comparisons, as PNG files.
 
-The only module that imports matplotlib; import it only where a figure was asked for.  Figures are
-built without pyplot, so there is no display, no backend and no global state.  Every function takes
-plain arrays, writes one file and returns its path.
+Only the plots modules import matplotlib; import them only where a figure was asked for.  Figures
+are built without pyplot, so there is no display, no backend and no global state.  Every function
+takes plain arrays, writes one file and returns its path.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from can_imm.plots_style import STYLE as _STYLE
+from can_imm.plots_style import save as _save
 from can_imm.types import VX, FloatArray, Manoeuvre, X
 
 Int8Array = npt.NDArray[np.int8]
@@ -38,20 +40,6 @@ COLOURS = {
 MANOEUVRES = tuple(m for m in Manoeuvre if m is not Manoeuvre.UNKNOWN)
 STATES = (("x", "m"), ("vx", "m/s"), ("y", "m"), ("vy", "m/s"))
 _TRUE, _FILTERED, _MEASURED, _BAR = "#000000", "#0072b2", "#9a9a9a", "#6f8fb0"
-_STYLE: Any = {
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 10,
-    "figure.dpi": 150,
-    "font.size": 9,
-    "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "lines.linewidth": 1.2,
-}
 
 
 def _name(manoeuvre: int) -> str:
@@ -61,13 +49,6 @@ def _name(manoeuvre: int) -> str:
 def _axis_label(name: str, unit: str) -> str:
     pretty = {"x": "$x$", "vx": "$v_x$", "y": "$y$", "vy": "$v_y$"}
     return f"{pretty[name]} [{unit}]"
-
-
-def _save(figure: Figure, directory: Path, name: str) -> Path:
-    directory.mkdir(parents=True, exist_ok=True)
-    path = directory / f"{name}.png"
-    figure.savefig(path)
-    return path
 
 
 def _spans(t_s: FloatArray, labels: Int8Array) -> list[tuple[float, float, int]]:

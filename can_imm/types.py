@@ -52,9 +52,12 @@ class Scan:
         std: (capacity, 4) standard deviations of ``z``, same units.
         valid: (capacity, 4) which components were measured; the others' values mean nothing.
         new: (capacity,) the sensor says that this id names another object than in its last scan.
+        existence: (capacity,) probability that the object exists; 1 from a sensor that gives none.
     """
 
-    __slots__ = ("counter", "ids", "incomplete", "n", "new", "std", "t_ns", "valid", "z")
+    __slots__ = (
+        "counter", "existence", "ids", "incomplete", "n", "new", "std", "t_ns", "valid", "z",
+    )  # fmt: skip
 
     def __init__(self, capacity: int) -> None:
         self.t_ns = 0
@@ -66,6 +69,7 @@ class Scan:
         self.std: FloatArray = np.ones((capacity, 4))
         self.valid: BoolArray = np.zeros((capacity, 4), np.bool_)
         self.new: BoolArray = np.zeros(capacity, np.bool_)
+        self.existence: FloatArray = np.ones(capacity)
 
     @property
     def capacity(self) -> int:
@@ -81,7 +85,56 @@ class Scan:
             other.incomplete,
             n,
         )
-        for name in ("ids", "z", "std", "valid", "new"):
+        for name in ("ids", "z", "std", "valid", "new", "existence"):
+            getattr(self, name)[:n] = getattr(other, name)[:n]
+
+
+RANGE, BEARING, RATE = 0, 1, 2
+"""Columns of `DetectionScan.z`."""
+POSE_X, POSE_Y, POSE_HEADING, POSE_VX, POSE_VY = 0, 1, 2, 3, 4
+"""Columns of `DetectionScan.pose`."""
+
+
+class DetectionScan:
+    """What several sensors detected at about the same time, in preallocated arrays.
+
+    Rows ``0 <= s < n_sensors`` and ``0 <= i < n`` are in use.  A sensor that looked and saw nothing
+    has its row, too; one that is gone has none.  Poses are in axes that stand still, the same for
+    all sensors of a system.
+
+    Attributes:
+        t_ns: time of the earliest measurement on the bus clock [ns].
+        n_sensors: number of sensors that took part.
+        sensor_id: (sensors,) int32, 0 to 14.
+        counter: (sensors,) int32, each sensor's own scan counter, 0 to 255.
+        delay: (sensors,) the sensor measured so long after ``t_ns`` [s], 0 or more.
+        pose: (sensors, 5) x, y [m], heading [rad], vx, vy [m/s] of the sensor at its measurement.
+        n: number of detections, of all sensors.
+        sensor: (capacity,) int32, row of the sensor that made the detection, ascending.
+        z: (capacity, 3) range [m], bearing [rad] from the sensor's heading, positive to the left,
+            and rate of change of the range [m/s], NaN where the sensor measures none.
+    """
+
+    __slots__ = ("counter", "delay", "n", "n_sensors", "pose", "sensor", "sensor_id", "t_ns", "z")
+
+    def __init__(self, sensors: int, capacity: int) -> None:
+        self.t_ns = 0
+        self.n_sensors = 0
+        self.sensor_id: IntArray = np.zeros(sensors, np.int32)
+        self.counter: IntArray = np.zeros(sensors, np.int32)
+        self.delay: FloatArray = np.zeros(sensors)
+        self.pose: FloatArray = np.zeros((sensors, 5))
+        self.n = 0
+        self.sensor: IntArray = np.zeros(capacity, np.int32)
+        self.z: FloatArray = np.zeros((capacity, 3))
+
+    def copy_from(self, other: DetectionScan) -> None:
+        """Take over another scan's content; it must fit."""
+        n, sensors = other.n, other.n_sensors
+        self.t_ns, self.n, self.n_sensors = other.t_ns, n, sensors
+        for name in ("sensor_id", "counter", "delay", "pose"):
+            getattr(self, name)[:sensors] = getattr(other, name)[:sensors]
+        for name in ("sensor", "z"):
             getattr(self, name)[:n] = getattr(other, name)[:n]
 
 

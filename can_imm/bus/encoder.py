@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,25 +53,25 @@ class StatusValues(NamedTuple):
 
 
 @cache
-def own_dbc() -> Any:
-    """The cantools database of can_imm.dbc."""
-    return load_dbc(DBC)
+def own_dbc(path: Path = DBC) -> Any:
+    """The cantools database of can_imm.dbc, or of another DBC file of ours."""
+    return load_dbc(path)
 
 
 class MessageEncoder:
-    """Packs one message of can_imm.dbc and protects it.
+    """Packs one message of can_imm.dbc, or of another DBC file of ours, and protects it.
 
     ``encode`` takes the physical values in the order of ``signals``; a value that is NaN or out of
     range is sent as "not available" where the signal has such a code, otherwise as the end of the
     range.
     """
 
-    def __init__(self, name: str, signals: tuple[str, ...]) -> None:
-        message = own_dbc().get_message_by_name(name)
+    def __init__(self, name: str, signals: tuple[str, ...], dbc: Path = DBC) -> None:
+        message = own_dbc(dbc).get_message_by_name(name)
         self.id: int = message.frame_id
         self.cycle_ns: int = message.cycle_time * 1_000_000
         self._length: int = message.length
-        self._data_id = p01_data_id(message, DBC)
+        self._data_id = p01_data_id(message, dbc)
         self._counter = 0
         self._parts: list[tuple[int, Field]] = []
         for signal in map(message.get_signal_by_name, signals):

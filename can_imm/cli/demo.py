@@ -4,6 +4,8 @@
   can-imm demo --realtime                      at the speed of life
   can-imm demo --scenario random --seed 7      another drive
   can-imm demo --plot figures                  and the paper's figures 3 to 8 of this run
+  can-imm demo cooperative                     radars of five vehicles, a tracker, the detector
+  can-imm demo roadside                        lidars beside a road, a tracker, the detector
 
 The radar's frames are encoded, sent, received and decoded as on a real bus; only time is faster.
 Without a terminal there is a plain line per change of manoeuvre, as fast as possible.  Ctrl-C ends
@@ -31,10 +33,17 @@ PLAIN_WIDTH = 80
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
+        "system",
+        nargs="?",
+        choices=("cooperative", "roadside"),
+        metavar="cooperative|roadside",
+        help="several sensors and a tracker instead of one radar",
+    )
+    parser.add_argument(
         "--scenario",
-        default="paper-a",
         metavar="NAME|FILE|random",
-        help="paper-a (default), paper-b, paper-s, random, or a TOML file",
+        help="paper-a (default), paper-b, paper-s, random, or a TOML file; with a tracker the TOML "
+        "file of a scene",
     )
     parser.add_argument(
         "--seed",
@@ -64,6 +73,9 @@ def _seed(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.system is not None:
+        return _track(args)
+    args.scenario = args.scenario or "paper-a"
     from rich.console import Console
 
     from can_imm.cli.compiling import announced
@@ -94,6 +106,25 @@ def run(args: argparse.Namespace) -> int:
         drawn = paper_figures(args.plot, seen[0], said[0])
         console.print(f"\n{len(drawn)} figures in {args.plot}", markup=False)
     return 0
+
+
+def _track(args: argparse.Namespace) -> int:
+    from can_imm.cli.compiling import announced
+    from can_imm.types import CanImmError
+
+    if args.plot is not None:
+        raise CanImmError(f"--plot: 'can-imm study' draws the figures of {args.system} tracking")
+    with announced():
+        from can_imm.cli.demo_tracking import TrackingDemo
+
+        show = TrackingDemo(args.system, args.scenario or args.system, args.preset, args.seed)
+    interrupted = False
+    try:
+        show.play(1.0 if args.realtime else None)
+    except KeyboardInterrupt:
+        interrupted = True
+    show.summary()
+    return 128 + signal.SIGINT if interrupted else 0
 
 
 def _play(show: DemoRun, console: Console, title: str, realtime: bool) -> None:

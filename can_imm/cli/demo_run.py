@@ -23,7 +23,7 @@ from can_imm.manoeuvres import load_bank
 from can_imm.runtime.clock import FastClock
 from can_imm.runtime.feeds import BusFeed
 from can_imm.runtime.health import Health, LatencyLog
-from can_imm.runtime.loop import STEP_NS, Loop
+from can_imm.runtime.loop import STEP_NS, Loop, Node
 from can_imm.runtime.loop import run as run_loops
 from can_imm.runtime.nodes import DetectorNode, Reports, SenderNode
 from can_imm.sim.player import Player
@@ -175,13 +175,13 @@ class DemoRun:
             )
             detector = Loop(
                 BusFeed(BusSource(far), clock, self.health),
-                _Timed(self.node, self.work),
+                Timed(self.node, self.work),
                 self.health,
                 [BusSink(far)],
             )
             # one step more, in which the sender's side hears the last answer
             steps = (START_NS + self.duration_ns) // STEP_NS + 2
-            pace = _pacer(rate)
+            pace = pacer(rate)
             run_loops([sender, detector], stop=lambda: health.steps >= steps or pace())
 
     def so_far(self) -> tuple[list[Observation], list[Answer]]:
@@ -199,10 +199,10 @@ class DemoRun:
         self.on_scan()
 
 
-class _Timed:
+class Timed:
     """A node whose work is timed when there are frames for it."""
 
-    def __init__(self, node: DetectorNode, log: LatencyLog) -> None:
+    def __init__(self, node: Node, log: LatencyLog) -> None:
         self._node = node
         self._log = log
 
@@ -220,7 +220,7 @@ def _first_rows(said: Answer, n: int) -> Answer:
     return Answer(said.manoeuvre[:n], said.p[:n], said.x[:n], said.cov[:n])
 
 
-def _pacer(rate: float | None) -> Callable[[], bool]:
+def pacer(rate: float | None) -> Callable[[], bool]:
     """Return a function that sleeps until the next round of steps is due; it returns False."""
     due_s = time.monotonic()
 

@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         feed = BusFeed(own, clock, health)
         loop = Loop(feed, detection.node, health, [own], [log] if log else [])
         trouble = Trouble(health, source, sink, queue)
-        stop = _until_told(args.duration, health)
+        stop = until_told(args.duration, health)
 
         # What exists now stays; a full collection would stop the loop for tens of milliseconds.
         gc.collect()
@@ -147,7 +147,7 @@ class Trouble:
         return False
 
 
-def _until_told(duration_s: float | None, health: Health) -> Callable[[], bool]:
+def until_told(duration_s: float | None, health: Health) -> Callable[[], bool]:
     """Return a test whether to stop: by SIGINT, SIGTERM or the time that was given."""
     told = False
 

@@ -32,6 +32,7 @@ from can_imm import __version__
 COMMANDS = {
     "demo": "watch the detector follow the published scenario, then read how well it did",
     "simulate": "play a scenario as radar frames onto a bus and/or into a log file",
+    "track": "make objects of the detections of several sensors, on a bus or in a log",
     "detect": "listen on a bus and answer with manoeuvre frames until Ctrl-C",
     "replay": "run the detector over a recorded log",
     "study": "measure the detector by Monte Carlo and draw the paper's figures",

@@ -4,6 +4,7 @@
   can-imm simulate -i socketcan -c vcan0 --scenario random --seed 7
   can-imm simulate --log drive.log --truth drive.csv   as fast as possible, no bus
   can-imm simulate --scenario mine.toml --log mine.blf
+  can-imm simulate --scenario cooperative -i udp_multicast     detections, for 'can-imm track'
 
 A bus is used when a bus option is given, or when there is no file to write; it plays in real time.
 Bus settings that are not given come from python-can's configuration files.  The times in the
@@ -24,7 +25,12 @@ from can_imm.cli.bus_options import add_bus_arguments, bus_name, bus_wanted, ope
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import numpy as np
+
+    from can_imm.runtime.nodes import SenderNode
+    from can_imm.sim.scene import SceneRun
     from can_imm.sim.truth import Truth
+    from can_imm.types import DetectionScan, Scan
 
 LEAD_NS = 500_000_000
 """On a bus the scenario starts this long [ns] after the command is ready to send."""
@@ -35,7 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scenario",
         default="paper-a",
         metavar="NAME|FILE|random",
-        help="paper-a (default), paper-b, paper-s, random, or a TOML file",
+        help="paper-a (default), paper-b, paper-s, random, or a TOML file; cooperative, roadside "
+        "or the TOML file of such a scene: detections of several sensors",
     )
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="of noise and random scenario (default: 0)"
@@ -64,6 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     import numpy as np
 
+    from can_imm.bus.detections import DetectionEncoder
     from can_imm.bus.encoder import RadarEncoder
     from can_imm.bus.sinks import BusSink, LogSink
     from can_imm.runtime.clock import Clock, FastClock, WallClock
@@ -75,6 +83,7 @@ def run(args: argparse.Namespace) -> int:
     from can_imm.sim.player import Player
     from can_imm.sim.random import random_scenario
     from can_imm.sim.scenario import load_scenario
+    from can_imm.sim.scene import scene_kind
     from can_imm.sim.sensor import SensorModel, measure
     from can_imm.sim.truth import simulate
     from can_imm.types import CanImmError
@@ -82,9 +91,18 @@ def run(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise CanImmError(f"--seed must be 0 or more, not {args.seed}")
     rng = np.random.default_rng(args.seed)
-    scenario = random_scenario(rng) if args.scenario == "random" else load_scenario(args.scenario)
-    truths = simulate(scenario)
-    scans = measure(truths, SensorModel(missed=args.missed, dropout=args.dropout), rng)
+    kind = scene_kind(args.scenario)
+    played = None
+    truths: list[Truth] = []
+    sender: SenderNode[Scan] | SenderNode[DetectionScan]
+    if kind is not None:
+        if args.missed or args.dropout:
+            raise CanImmError("--missed and --dropout: a scene's own table says this")
+        played = play(kind, args.scenario, rng)
+    else:
+        random = args.scenario == "random"
+        truths = simulate(random_scenario(rng) if random else load_scenario(args.scenario))
+        scans = measure(truths, SensorModel(missed=args.missed, dropout=args.dropout), rng)
 
     with ExitStack() as stack:
         outputs = []
@@ -101,23 +119,49 @@ def run(args: argparse.Namespace) -> int:
         log = LogSink(args.log) if args.log else None
         if log is not None:
             stack.callback(log.close)
-        if args.truth:
-            write_truth(args.truth, truths, start_ns)
         health = Health()
-        player = Player(scans, start_ns)
-        loop = Loop(
-            IdleFeed(clock),
-            SenderNode(player, RadarEncoder()),
-            health,
-            outputs,
-            [log] if log else [],
-        )
-        _say(f"playing {args.scenario} {where}: {len(truths)} objects, {len(scans)} scans")
-        run_loops([loop], stop=lambda: player.done)
+        if played is not None:
+            if args.truth:
+                write_scene_truth(args.truth, played, start_ns)
+            detections = Player(played.scans, start_ns)
+            done, sender = lambda: detections.done, SenderNode(detections, DetectionEncoder())
+            what = f"{len(played.scans)} scans of several sensors"
+        else:
+            if args.truth:
+                write_truth(args.truth, truths, start_ns)
+            player = Player(scans, start_ns)
+            done, sender = lambda: player.done, SenderNode(player, RadarEncoder())
+            what = f"{len(truths)} objects, {len(scans)} scans"
+        loop = Loop(IdleFeed(clock), sender, health, outputs, [log] if log else [])
+        _say(f"playing {args.scenario} {where}: {what}")
+        run_loops([loop], stop=done)
     if log is not None and log.damage:
         raise CanImmError(log.damage)
     _say(f"sent {health.sent:,} frames, {health.deadline_misses:,} deadlines missed")
     return 0
+
+
+def play(kind: str, name_or_path: str, rng: np.random.Generator) -> SceneRun:
+    """Play a scene of several sensors."""
+    if kind == "cooperative":
+        from can_imm.sim import cooperative
+
+        return cooperative.play_scene(cooperative.load_scene(name_or_path), rng)
+    from can_imm.sim import roadside
+
+    return roadside.play_scene(roadside.load_scene(name_or_path), rng)
+
+
+def write_scene_truth(path: str, played: SceneRun, start_ns: int) -> None:
+    """Write one row per scan of a scene with one object, while it is there."""
+    from can_imm.cli.reports import STATES, seconds
+
+    with Path(path).open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["time_s", *STATES])
+        for t_ns, state in zip(played.t_ns.tolist(), played.state.tolist(), strict=True):
+            if all(value == value for value in state):
+                writer.writerow([seconds(start_ns + t_ns), *(f"{value:.4f}" for value in state)])
 
 
 def write_truth(path: str, truths: Sequence[Truth], start_ns: int) -> None:

@@ -3,6 +3,9 @@
   can-imm study paper                          table for the published scenario and random ones
   can-imm study paper --json out.json --plots figures
   can-imm study tune-rules                     how the baselines' constants were found
+  can-imm study bernoulli                      cooperative radars: errors over the parameters
+  can-imm study roadside                       lidars beside the road: IMM-UKF and single models
+  can-imm study tune-roadside                  how their constants were found
 
 Studies report on seeds from 1000 on; everything was tuned on seeds below.
 """
@@ -11,18 +14,25 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
+
+from can_imm.cli import study_bernoulli, study_roadside
+from can_imm.cli.study_common import (
+    add_jobs,
+    cell,
+    new_table,
+    not_negative,
+    open_console,
+    positive,
+    progress_bar,
+)
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
 
     from can_imm.studies.paper import Result
-
-_PLAIN_WIDTH = 80
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,11 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(readings A, B and S) and on random scenarios.",
     )
     paper.add_argument(
-        "--runs", type=_positive, default=100, metavar="N", help="seeds per truth (default 100)"
+        "--runs", type=positive, default=100, metavar="N", help="seeds per truth (default 100)"
     )
     paper.add_argument(
         "--seed",
-        type=_not_negative,
+        type=not_negative,
         default=1000,
         metavar="S",
         help="first seed (default 1000; nothing was tuned on seeds from 1000 on)",
@@ -62,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="TRUTH",
         help="some of A B S random (default: all)",
     )
-    _add_jobs(paper)
+    add_jobs(paper)
     paper.set_defaults(study_run=_paper)
 
     tune = studies.add_parser(
@@ -76,37 +86,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     tune.set_defaults(study_run=_tune)
 
+    study_bernoulli.add_arguments(studies)
+    study_roadside.add_arguments(studies)
+
 
 def run(args: argparse.Namespace) -> int:
     status: int = args.study_run(args)
     return status
 
 
-def _add_jobs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--jobs", type=_positive, metavar="N", help="processes (default: one per core)"
-    )
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} is not positive")
-    return value
-
-
 def _half(text: str) -> int:
     # as many seeds again are needed for the check, all of them below 1000
-    value = _positive(text)
+    value = positive(text)
     if value > 500:
         raise argparse.ArgumentTypeError(f"{value} is more than 500")
-    return value
-
-
-def _not_negative(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{value} is negative")
     return value
 
 
@@ -125,7 +118,7 @@ def _paper(args: argparse.Namespace) -> int:
         args.plots.mkdir(parents=True, exist_ok=True)
     systems = list(dict.fromkeys(args.systems or SYSTEMS))
     truths = list(dict.fromkeys(args.truths or TRUTHS))
-    with _progress(args.runs * len(truths)) as advance:
+    with progress_bar(args.runs * len(truths)) as advance:
         results = study(
             args.runs,
             args.seed,
@@ -137,7 +130,7 @@ def _paper(args: argparse.Namespace) -> int:
     data = to_json(args.runs, args.seed, results)
     if args.json is not None:
         args.json.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", "utf-8")
-    console = _console()
+    console = open_console()
     console.print(
         f"{args.runs} run{'s' if args.runs > 1 else ''} per truth, seeds {args.seed} to "
         f"{args.seed + args.runs - 1}; standard errors with --json\n",
@@ -166,48 +159,6 @@ def _draw(
     return drawn + comparisons(directory, args.runs, results)
 
 
-def _console() -> Console:
-    from rich.console import Console
-
-    # without a terminal: no colours, and lines as long as the tables need
-    return Console() if sys.stdout.isatty() else Console(width=_PLAIN_WIDTH)
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[Any]:
-    """A progress bar on stderr where that is a terminal; yields a function that advances it."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task("runs", total=total)
-        yield lambda: bar.advance(task)
-
-
-def _table(title: str, columns: Sequence[str]) -> Table:
-    from rich import box
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(
-        title=title,
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-        show_edge=False,
-        collapse_padding=True,
-    )
-    for number, column in enumerate(columns):
-        side: Literal["left", "right"] = "left" if number < 2 else "right"
-        table.add_column(escape(column), justify=side, no_wrap=True)
-    return table
-
-
-def _cell(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
 def _manoeuvre_table(results: Sequence[dict[str, Any]]) -> Table:
     columns = {
         "accu-\nracy": ("accuracy", 4),
@@ -220,11 +171,11 @@ def _manoeuvre_table(results: Sequence[dict[str, Any]]) -> Table:
         "Brier": ("brier", 3),
         "ECE": ("ece", 3),
     }
-    table = _table("Manoeuvres", ["truth", "system", *columns])
+    table = new_table("Manoeuvres", ["truth", "system", *columns])
     for truth in dict.fromkeys(result["truth"] for result in results):
         for result in results:
             if result["truth"] == truth and result["accuracy"] is not None:
-                cells = [_cell(result[key], digits) for key, digits in columns.values()]
+                cells = [cell(result[key], digits) for key, digits in columns.values()]
                 table.add_row(truth, result["system"], *cells)
         table.add_section()
     return table
@@ -235,16 +186,16 @@ def _state_table(results: Sequence[dict[str, Any]]) -> Table:
 
     units = {"x": "m", "vx": "m/s", "y": "m", "vy": "m/s"}
     columns = [f"{state} [{unit}]" for state, unit in units.items()]
-    table = _table(
+    table = new_table(
         "RMSE of the states, and NEES (4 expected)", ["truth", "system", *columns, "NEES"]
     )
     for truth in dict.fromkeys(result["truth"] for result in results):
         for result in results:
             if result["truth"] == truth:
-                cells = [_cell(result["rmse"][state], 4) for state in units]
-                table.add_row(truth, result["system"], *cells, _cell(result["nees"], 2))
+                cells = [cell(result["rmse"][state], 4) for state in units]
+                table.add_row(truth, result["system"], *cells, cell(result["nees"], 2))
         if truth != "random":
-            table.add_row(truth, "paper, Table 6", *(_cell(TABLE_6[s], 4) for s in units), "-")
+            table.add_row(truth, "paper, Table 6", *(cell(TABLE_6[s], 4) for s in units), "-")
         table.add_section()
     return table
 

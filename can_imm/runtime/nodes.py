@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy.typing as npt
 
 from can_imm.bus.encoder import DetectorState, ManoeuvreEncoder, StatusValues
 from can_imm.bus.frame import Frame
 from can_imm.runtime.health import Health
-from can_imm.types import Scan
+from can_imm.types import DetectionScan, Scan
 
 if TYPE_CHECKING:
     from can_imm.bus.decoder import ScanDecoder
-    from can_imm.bus.encoder import RadarEncoder
     from can_imm.detector import Detector
     from can_imm.sim.player import Player
 
@@ -25,6 +24,9 @@ SENSOR_TIMEOUT_NS = 1_000_000_000
 MAX_WAITING = 8
 """Scans that may wait for their step when several come at once."""
 
+S = TypeVar("S", Scan, DetectionScan)
+S_contra = TypeVar("S_contra", contravariant=True)
+
 Reports = npt.NDArray[Any]
 """Structured array of `can_imm.types.REPORT_DTYPE`."""
 
@@ -33,12 +35,19 @@ Listener = Callable[[int, Reports], None]
 detector's own buffer and holds good until the next step."""
 
 
-class SenderNode:
+class ScanEncoder(Protocol[S_contra]):
+    """Writes scans of one kind as frames."""
+
+    def encode(self, scan: S_contra, t_ns: int, /) -> list[Frame]:
+        """Frames of ``scan``, stamped ``t_ns`` [ns]."""
+
+
+class SenderNode(Generic[S]):
     """Sends the scans of a player as frames, when they are due."""
 
-    def __init__(self, player: Player, encoder: RadarEncoder) -> None:
-        self._player = player
-        self._encoder = encoder
+    def __init__(self, player: Player[S], encoder: ScanEncoder[S]) -> None:
+        self._player: Player[S] = player
+        self._encoder: ScanEncoder[S] = encoder
 
     def step(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
         scan = self._player.step(t_ns)

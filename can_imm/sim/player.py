@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Generic, Protocol, TypeVar
 
-from can_imm.types import Scan
+
+class Timed(Protocol):
+    """A scan of any kind; ``t_ns`` is its time [ns]."""
+
+    t_ns: int
 
 
-class Player:
+S = TypeVar("S", bound=Timed)
+
+
+class Player(Generic[S]):
     """Hands out scans in order of time, for the sender's fixed-step loop.
 
     Args:
@@ -15,7 +23,7 @@ class Player:
         start_ns: time on the caller's clock at which the scans' time 0 lies [ns].
     """
 
-    def __init__(self, scans: Sequence[Scan], start_ns: int = 0) -> None:
+    def __init__(self, scans: Sequence[S], start_ns: int = 0) -> None:
         self._scans = scans
         self._start_ns = start_ns
         self._next = 0
@@ -25,7 +33,7 @@ class Player:
         """All scans have been handed out."""
         return self._next == len(self._scans)
 
-    def step(self, t_ns: int) -> Scan | None:
+    def step(self, t_ns: int) -> S | None:
         """The next scan if it is due by ``t_ns`` on the caller's clock, else None.
 
         At most one scan per step; with steps longer than the sensor's period the scans come late

@@ -11,7 +11,7 @@ from bus_frames import REAL_DATA, ROOT, protect
 
 from can_imm.types import Manoeuvre
 
-FILES = ["can_imm.dbc", "toyota.dbc"]
+FILES = ["can_imm.dbc", "toyota.dbc", "tracking.dbc"]
 
 
 def run_cantools(*arguments: str, stdin: str = "") -> str:

@@ -10,8 +10,8 @@ from can_imm.types import CanImmError
 
 
 def test_built_in_profiles():
-    assert builtin_profiles() == ["can_imm", "toyota"]
-    own, toyota = map(load_profile, builtin_profiles())
+    assert builtin_profiles() == ["can_imm", "toyota", "tracking"]
+    own, toyota, _ = map(load_profile, builtin_profiles())
     assert (own.name, own.period_ns, own.dbc.name) == ("can_imm", 100_000_000, "can_imm.dbc")
     assert own.header is not None
     assert [c.std for c in own.state] == [0.1, 0.3, 0.2, 0.3]

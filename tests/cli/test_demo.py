@@ -133,7 +133,7 @@ def test_pacing_keeps_time_and_forgets_a_stall(monkeypatch):
         now[0] += seconds
 
     monkeypatch.setattr(demo_run, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
-    pace = demo_run._pacer(5.0)
+    pace = demo_run.pacer(5.0)
     for _ in range(100):
         now[0] += 0.0005  # the work of a step
         assert not pace()
