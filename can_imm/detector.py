@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from can_imm.estimation import imm
+from can_imm.estimation.noise import noise_state
 from can_imm.estimation.particles import N_COLUMNS
 from can_imm.manoeuvres import ModeBank
 from can_imm.reporting import extrapolate_all_, fill_reports_
@@ -95,7 +96,7 @@ class Detector:
         self._gate = gate
         self._max_outliers = max_outliers
         self._modulus = counter_modulus
-        self._rng = np.random.default_rng(seed)
+        self._noise = noise_state(np.random.default_rng(seed))
         self._objects = np.zeros(capacity, imm.OBJECT_DTYPE)
         self._work = np.zeros(1, imm.WORK_DTYPE)
         self._particles: FloatArray = np.zeros((capacity, bank.n_particles, N_COLUMNS))
@@ -267,7 +268,7 @@ class Detector:
             self._particles,
             self._spare,
             self._weights,
-            self._rng,
+            self._noise,
             self._status,
         )
 

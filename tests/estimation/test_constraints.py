@@ -120,7 +120,25 @@ def moments(a: float, b: float) -> tuple[float, float, float]:
     return log_mass - (0.5 * a * a if a > 0 else 0.0), start + u * reach, variance
 
 
-ENDS = [-np.inf, -9.0, -5.0, -2.0, -0.3, 0.0, 0.7, 1.9, 4.99, 5.0, 5.01, 6.5, 10.0, 15.0, 30.0, 36.0, np.inf]
+ENDS = [
+    -np.inf,
+    -9.0,
+    -5.0,
+    -2.0,
+    -0.3,
+    0.0,
+    0.7,
+    1.9,
+    4.99,
+    5.0,
+    5.01,
+    6.5,
+    10.0,
+    15.0,
+    30.0,
+    36.0,
+    np.inf,
+]
 INTERVALS = [(a, b) for a in ENDS for b in ENDS if a < b and (np.isfinite(a) or np.isfinite(b))]
 
 
