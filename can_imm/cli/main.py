@@ -34,6 +34,8 @@ COMMANDS = {
     "simulate": "play a scenario as radar frames onto a bus and/or into a log file",
     "detect": "listen on a bus and answer with manoeuvre frames until Ctrl-C",
     "replay": "run the detector over a recorded log",
+    "latency": "measure how long answers take on a bus, stage by stage",
+    "bench": "measure the speed beside filterpy, cantools and python-can",
     "study": "measure the detector by Monte Carlo and draw the paper's figures",
 }
 

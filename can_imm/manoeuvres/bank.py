@@ -71,6 +71,16 @@ def load_bank(name_or_path: str, *, step_ns: int = 10_000_000) -> ModeBank:
     Raises:
         CanImmError: the file is missing, is not TOML or does not describe a mode bank.
     """
+    path, data = preset_data(name_or_path)
+    return bank_from_dict(data, str(path), step_ns=step_ns)
+
+
+def preset_data(name_or_path: str) -> tuple[Path, dict[str, Any]]:
+    """Path of a preset's TOML file and what it holds, unchecked.
+
+    Raises:
+        CanImmError: the file is missing or is not TOML.
+    """
     path = PRESETS / f"{name_or_path}.toml"
     if name_or_path not in builtin_presets():
         path = Path(name_or_path)
@@ -85,7 +95,7 @@ def load_bank(name_or_path: str, *, step_ns: int = 10_000_000) -> ModeBank:
         raise CanImmError(f"{path}: {e.strerror or e}") from e
     except (ValueError, RecursionError) as e:  # of TOML, of UTF-8, of numbers, of nesting
         raise CanImmError(f"{path}: not a TOML file: {e}") from e
-    return bank_from_dict(data, str(path), step_ns=step_ns)
+    return path, data
 
 
 _KINDS = {
