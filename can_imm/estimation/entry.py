@@ -7,6 +7,8 @@ from typing import Any
 
 import numba
 
+_typeof: Callable[[Any], Any] = numba.typeof
+
 
 def entry_point(kernel: Any, *args: Any) -> Callable[..., Any]:
     """Return the machine code of ``kernel`` for arguments of these types, compiled if need be.
@@ -15,7 +17,7 @@ def entry_point(kernel: Any, *args: Any) -> Callable[..., Any]:
     one object as much time as its arithmetic.  What is returned does not: give it arguments of
     these types and no others.
     """
-    signature = tuple(numba.typeof(arg) for arg in args)
+    signature = tuple(map(_typeof, args))
     kernel.compile(signature)
     code: Callable[..., Any] = kernel.get_overload(signature)
     return code

@@ -806,9 +806,26 @@ def process_scan_(
         if steps[k] < 0:
             status[k] = birth_(bank[0], objects[s], work[0], z[k], r[k], valid[k], age)
         elif bank[0].n_states == 4:
-            # The usual number of states as a constant lets the compiler unroll everything.
+            # The number of states as a constant lets the compiler unroll everything.
             status[k] = cycle_(
                 4,
+                bank[0],
+                objects[s],
+                work[0],
+                steps[k],
+                z[k],
+                r[k],
+                valid[k],
+                age,
+                gate,
+                particles[s],
+                spare,
+                weights,
+                noise,
+            )
+        elif bank[0].n_states == 5:
+            status[k] = cycle_(
+                5,
                 bank[0],
                 objects[s],
                 work[0],
