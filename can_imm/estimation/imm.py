@@ -266,7 +266,8 @@ def reference(
     """
     if kind == FIXED:
         return 0.0
-    return min(max(math.floor(y / width + 0.5), lanes[0]), lanes[1]) * width
+    lane: float = min(max(math.floor(y / width + 0.5), lanes[0]), lanes[1])
+    return lane * width
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)

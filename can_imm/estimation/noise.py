@@ -9,6 +9,7 @@ registers: ``s = load(state)``, then ``value, s = normal(s)``, at the end ``stor
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import numba
@@ -38,7 +39,7 @@ def _tables() -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.float64], npt.NDAr
     width = x / _SCALE
     width[0] = _V / math.exp(-0.5 * _R**2) / _SCALE
     bound[0] = int(_R / width[0])
-    bound[2:] = [int(a / b * _SCALE) for a, b in zip(x[1:-1], x[2:], strict=True)]
+    bound[2:] = [int(a / b * _SCALE) for a, b in pairwise(x[1:])]
     return bound, width, np.exp(-0.5 * x**2)
 
 

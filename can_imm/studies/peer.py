@@ -40,6 +40,8 @@ class ConstrainedFilter(KalmanFilter):  # type: ignore[misc]
     ) -> None:
         record, n = bank.record[0], bank.n_states
         super().__init__(dim_x=n, dim_z=len(seen))
+        self.x: FloatArray
+        self.P: FloatArray
         self.F = record["F"][steps, j, :n, :n].copy()
         self.Q = record["Q"][steps, j, :n, :n].copy()
         self.H = np.eye(n)[seen]
