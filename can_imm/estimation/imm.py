@@ -170,9 +170,11 @@ def mix_(n: int, bank: Any, obj: Any, work: Any, j: int) -> None:  # pragma: no 
     """
     n_modes = bank.n_modes
     n_sources = 0
+    entered = 0  # states that are replaced for any source
     for i in range(n_modes):
         if work.w[i] > 0.0:
             work.source[n_sources] = i
+            entered |= bank.entry_sources[i, j]
             n_sources += 1
     for s in range(n):
         v = 0.0
@@ -193,7 +195,7 @@ def mix_(n: int, bank: Any, obj: Any, work: Any, j: int) -> None:  # pragma: no 
             for k in range(n_sources):
                 i = work.source[k]
                 p = work.sx[k, s] * work.sx[k, t]
-                if not bank.entry_sources[i, j] & replaced:
+                if not entered & replaced or not bank.entry_sources[i, j] & replaced:
                     p += obj.P[i, s, t]
                 elif s == t:
                     p += bank.entry_var[j, s]

@@ -178,7 +178,7 @@ def weigh_(
         return top
     s = 0.0
     for a in range(n):
-        logw[a] = math.exp(logw[a] - top)
+        logw[a] = math.exp(logw[a] - top) if logw[a] > -np.inf else 0.0
         s += logw[a]
     for a in range(n):
         logw[a] /= s
@@ -203,6 +203,8 @@ def moments_(
         m3 += w[a] * p[a, 3]
     x[0], x[1], x[2], x[3] = m0, m1, m2, m3
     for a in range(p.shape[0]):
+        if w[a] == 0.0:
+            continue
         for c in range(4):
             wc = w[a] * (p[a, c] - x[c])
             for d in range(c + 1):

@@ -46,6 +46,10 @@ class Histogram:
     BINS = int(math.log(1e11 / LEAST_NS) / _WIDTH) + 1
 
     def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all entries."""
         self.counts = [0] * self.BINS
         self.n = 0
         self.max_ns = 0
@@ -220,6 +224,12 @@ class Rounds:
         self.echo = Histogram()
         self.lost = 0
         self._source, self._sink, self._probe = source, sink, probe
+
+    def reset(self) -> None:
+        """Forget all rounds."""
+        for histogram in (*self.stages.values(), self.echo):
+            histogram.reset()
+        self.lost = 0
 
     def scan(self, frames: Sequence[Frame], answers: int) -> None:
         """One round: ``answers`` frames beside DetectorStatus are the complete answer."""
