@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from can_imm.estimation import imm
+from can_imm.estimation.entry import entry_point
+from can_imm.estimation.noise import noise_state
 from can_imm.estimation.particles import N_COLUMNS
 from can_imm.manoeuvres import ModeBank
 from can_imm.reporting import extrapolate_all_, fill_reports_
@@ -92,9 +94,9 @@ class Detector:
         self.predicted: np.ndarray[Any, np.dtype[np.void]] = np.zeros(capacity, REPORT_DTYPE)
         self._step_ns = bank.step_ns
         self._coast_steps = min(int(coast_s * 1e9) // bank.step_ns, imm.MAX_STEPS - 1)
-        self._gate = gate
+        self._gate = float(gate)
         self._max_outliers = max_outliers
-        self._rng = np.random.default_rng(seed)
+        self._noise = noise_state(np.random.default_rng(seed))
         self._objects = np.zeros(capacity, imm.OBJECT_DTYPE)
         self._work = np.zeros(1, imm.WORK_DTYPE)
         self._particles: FloatArray = np.zeros((capacity, bank.n_particles, N_COLUMNS))
@@ -135,16 +137,12 @@ class Detector:
         scan = Scan(1)
         self._grow_rows(self.capacity)
         self._slot[0] = -1
-        self._process(scan, 1, 0.0)
-        fill_reports_(
-            self._objects,
-            self._id,
-            self._age,
-            self._measured,
-            self.bank.record,
-            0,
-            self.reports,
-        )
+        arguments = self._arguments(scan, 1, 0.0)
+        self._process = entry_point(imm.process_scan_, *arguments)
+        self._process(*arguments)
+        arguments = self._report_arguments(0)
+        self._fill = entry_point(fill_reports_, *arguments)
+        self._fill(*arguments)
         self.predict(0)
 
     def step(self, t_ns: int, scan: Scan | None) -> int:
@@ -172,7 +170,7 @@ class Detector:
         np.square(self._r[:n], out=self._r[:n])
         if self.bank.measurement_variance is not None:
             self._r[:n] = self.bank.measurement_variance
-        self._process(scan, n, (t_ns - scan.t_ns) * 1e-9)
+        self._process(*self._arguments(scan, n, (t_ns - scan.t_ns) * 1e-9))
         self._settle(scan, now)
         self._bury(now)
         return self._report(t_ns, now)
@@ -220,20 +218,22 @@ class Detector:
         """Give every row of the scan its slot (-1: none) and the steps since its last update."""
         seen: set[int] = set()
         std = scan.std[: scan.n]
-        usable = (np.abs(scan.z[: scan.n]) < LARGEST) & (std > 0.0) & (std < LARGEST)
-        usable &= scan.valid[: scan.n]
-        for k in range(scan.n):
-            self._slot[k] = -1
-            name = int(scan.ids[k])
+        valid = scan.valid[: scan.n]
+        usable = (np.abs(scan.z[: scan.n]) < LARGEST) & (std > 0.0) & (std < LARGEST) & valid
+        # usable where it counts, and in one component at least
+        sound = ((usable == valid).all(1) & usable.any(1)).tolist()
+        new = scan.new[: scan.n].tolist()
+        self._slot[: scan.n] = -1
+        for k, name in enumerate(scan.ids[: scan.n].tolist()):
             if name in seen:
                 self.counts.duplicates += 1
                 continue
             seen.add(name)
-            if not usable[k].any() or (scan.valid[k] & ~usable[k]).any():
+            if not sound[k]:
                 self.counts.invalid += 1
                 continue
             slot = self._slot_of.get(name)
-            if slot is not None and scan.new[k]:
+            if slot is not None and new[k]:
                 self.counts.reused_ids += 1
                 self._end(name)
                 slot = None
@@ -253,8 +253,9 @@ class Detector:
             self._slot[k] = slot
             self._steps[k] = -1 if self._age[slot] == 0 else now - self._updated[slot]
 
-    def _process(self, scan: Scan, n: int, age: float) -> None:
-        imm.process_scan_(
+    def _arguments(self, scan: Scan, n: int, age: float) -> tuple[Any, ...]:
+        """Of `imm.process_scan_`."""
+        return (
             self.bank.record,
             self._objects,
             self._work,
@@ -269,24 +270,24 @@ class Detector:
             self._particles,
             self._spare,
             self._weights,
-            self._rng,
+            self._noise,
             self._status,
         )
 
     def _settle(self, scan: Scan, now: int) -> None:
         """Act on what became of every measurement."""
-        for k in range(scan.n):
-            slot = int(self._slot[k])
+        slots, states = self._slot[: scan.n].tolist(), self._status[: scan.n].tolist()
+        for slot, status in zip(slots, states, strict=True):
             if slot < 0:
                 continue
-            if self._status[k] == imm.OK:
+            if status == imm.OK:
                 self.counts.measurements += 1
                 self._updated[slot] = now
                 self._age[slot] += 1
                 self._outliers[slot] = 0
                 self._measured[slot] = True
                 continue
-            if self._status[k] == imm.OUTLIER:
+            if status == imm.OUTLIER:
                 self.counts.outliers += 1
                 self._outliers[slot] += 1
                 if self._outliers[slot] < self._max_outliers:
@@ -305,23 +306,26 @@ class Detector:
 
     def _bury(self, now: int) -> None:
         """End the tracks that coasted for too long."""
+        updated = self._updated.tolist()
         for name, slot in list(self._slot_of.items()):
-            if now - self._updated[slot] > self._coast_steps:
+            if now - updated[slot] > self._coast_steps:
                 self._end(name)
+
+    def _report_arguments(self, t_ns: int) -> tuple[Any, ...]:
+        """Of `fill_reports_`."""
+        return (
+            self._objects,
+            self._id,
+            self._age,
+            self._measured,
+            self.bank.record,
+            t_ns,
+            self.reports,
+        )
 
     def _report(self, t_ns: int, now: int) -> int:
         """Reports of all tracks; coasting ones are extrapolated."""
-        n = int(
-            fill_reports_(
-                self._objects,
-                self._id,
-                self._age,
-                self._measured,
-                self.bank.record,
-                t_ns,
-                self.reports,
-            )
-        )
+        n: int = self._fill(*self._report_arguments(t_ns))
         coasting = self.reports["coasting"]
         if coasting[:n].any():
             self.predict(now * self._step_ns)

@@ -7,11 +7,11 @@ takes plain arrays, writes one file and returns its path.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import matplotlib as mpl
 import numpy as np
@@ -331,3 +331,34 @@ def comparison(
         axes.margins(x=0.28)
     figure.suptitle(title, x=0.01, ha="left", fontsize=10)
     return _save(figure, directory, name)
+
+
+class Distribution(Protocol):
+    """A histogram of durations, as `can_imm.runtime.latency.Histogram`."""
+
+    counts: list[int]
+    n: int
+
+    def edge_ns(self, i: int) -> float:
+        """Lower edge of bin ``i`` [ns]."""
+
+
+def latency_figure(path: Path, stages: Mapping[str, Distribution]) -> Path:
+    """Distributions of durations over a logarithmic axis, one row per stage."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(7.0, 0.6 * len(stages) + 1.0))
+        axes = figure.subplots(len(stages), 1, sharex=True, squeeze=False)[:, 0]
+        for ax, (name, stage) in zip(axes, stages.items(), strict=True):
+            # four bins of 1 % to one that can be seen
+            counts = [sum(stage.counts[i : i + 4]) for i in range(0, len(stage.counts), 4)]
+            edges = [stage.edge_ns(4 * i) / 1e3 for i in range(len(counts) + 1)]
+            share = [100.0 * count / max(stage.n, 1) for count in counts]
+            ax.stairs(share, edges, fill=True, color=_BAR)
+            ax.set_xscale("log")
+            ax.set_xlim(1.0, 1e5)
+            ax.set_yticks([])
+            ax.set_ylabel(name.replace("_", " "), rotation=0, ha="right", va="center")
+        axes[-1].set_xlabel("duration [us]")
+        figure.tight_layout()
+        figure.savefig(path)
+    return path

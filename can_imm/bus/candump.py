@@ -31,7 +31,7 @@ def parse(line: str) -> Frame | None:
         return None
     number = int(frame_id, 16)
     flags = 0
-    if len(frame_id) == 8 or direction is not None or number > 0x7FF:
+    if len(frame_id) == 8 or number > 0x7FF or (direction is not None and direction[-1:] in "Tt"):
         number, flags = _id_and_flags(frame_id, direction)
         if number < 0:
             return None
@@ -84,7 +84,7 @@ def _parse_other(line: str) -> Frame | None:
 def _time(seconds: str, fraction: str) -> int:
     if len(fraction) != 6:
         fraction = fraction[:6].ljust(6, "0")
-    return int(seconds) * 1_000_000_000 + int(fraction) * 1000
+    return int(seconds + fraction) * 1000
 
 
 def _id_and_flags(frame_id: str, direction: str | None) -> tuple[int, int]:

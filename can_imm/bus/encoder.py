@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from can_imm.bus.codec import Field, field, load_dbc
+from can_imm.bus.codec import compile_packer, field, load_dbc
 from can_imm.bus.frame import Frame
 from can_imm.bus.profile import dbc_dir
 from can_imm.bus.protection import P01_COUNTERS, p01_data_id, p01_protect
@@ -73,17 +73,13 @@ class MessageEncoder:
         self._length: int = message.length
         self._data_id = p01_data_id(message, dbc)
         self._counter = 0
-        self._parts: list[tuple[int, Field]] = []
-        for signal in map(message.get_signal_by_name, signals):
-            assert signal.byte_order == "little_endian"
-            self._parts.append((signal.start, field(signal)))
+        parts = [message.get_signal_by_name(name) for name in signals]
+        assert all(signal.byte_order == "little_endian" for signal in parts)
+        self._pack = compile_packer([(signal.start, field(signal)) for signal in parts])
 
     def encode(self, t_ns: int, *values: float) -> Frame:
         """The next frame of this id."""
-        word = 0
-        for (shift, scaling), value in zip(self._parts, values, strict=True):
-            word |= scaling.raw(value) << shift
-        data = bytearray(word.to_bytes(self._length, "little"))
+        data = bytearray(self._pack(*values).to_bytes(self._length, "little"))
         p01_protect(data, self._data_id, self._counter)
         self._counter = (self._counter + 1) % P01_COUNTERS
         return Frame(t_ns, self.id, bytes(data))

@@ -25,6 +25,8 @@ COLUMNS = [
     *(f"p_{mode.name.lower()}" for mode in MODES),
 ]
 
+_LANE_CHANGE = int(Manoeuvre.LANE_CHANGE)
+
 DIRECTION = {-1: "right", 0: "", 1: "left"}
 
 
@@ -90,9 +92,7 @@ class LaneChanges:
         self._latest: dict[tuple[int, int], LaneChange] = {}
 
     def __call__(self, t_ns: int, reports: Reports) -> None:
-        for report in reports:
-            if report["manoeuvre"] != Manoeuvre.LANE_CHANGE:
-                continue
+        for report in reports[reports["manoeuvre"] == _LANE_CHANGE]:
             at_ns = int(report["t_ns"])
             key = int(report["object_id"]), int(report["direction"])
             change = self._latest.get(key)

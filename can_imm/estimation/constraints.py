@@ -33,8 +33,8 @@ def log_upper_tail(a: float) -> float:  # pragma: no cover - compiled
     return -0.5 * a * a - LOG_SQRT_2PI - math.log(a) + math.log(series)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def truncated_normal(
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def _moments(
     lower: float, upper: float
 ) -> tuple[float, float, float]:  # pragma: no cover - compiled
     """Log mass, mean and variance of a standard normal restricted to [lower, upper].
@@ -91,6 +91,36 @@ def truncated_normal(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def truncated_normal(
+    lower: float, upper: float
+) -> tuple[float, float, float]:  # pragma: no cover - compiled
+    """Log mass, mean and variance of a standard normal restricted to [lower, upper].
+
+    Either bound may be infinite.  Below a log mass of `LOG_MASS_FLOOR` the log mass is clipped
+    there and the moments are those of the point of the interval that is nearest to 0.
+    """
+    return _moments(lower, upper)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def normal_mass(lower: float, upper: float) -> float:  # pragma: no cover - compiled
+    """The log mass of `truncated_normal` alone; the compiler leaves out the moments."""
+    return _moments(lower, upper)[0]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def interval_mass(
+    x: FloatArray, P: FloatArray, i0: int, lower: float, upper: float
+) -> float:  # pragma: no cover - compiled
+    """What `truncate_` would return, without its work on the moments."""
+    p = P[i0, i0]
+    if not (p > 0.0 and p < np.inf):
+        return np.nan
+    sd = math.sqrt(p)
+    return normal_mass((lower - x[i0]) / sd, (upper - x[i0]) / sd)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def truncate_(
     n: int,
     x: FloatArray,
@@ -133,7 +163,7 @@ def truncate_(
     return log_mass
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def project_(
     n: int, x: FloatArray, P: FloatArray, i0: int, d: float, floor: float, work: FloatArray
 ) -> bool:  # pragma: no cover - compiled

@@ -18,8 +18,15 @@ from typing import Any
 import numba
 import numpy as np
 
-from can_imm.estimation.constraints import LOG_MASS_FLOOR, project_, truncate_, truncated_normal
+from can_imm.estimation.constraints import (
+    LOG_MASS_FLOOR,
+    interval_mass,
+    normal_mass,
+    project_,
+    truncate_,
+)
 from can_imm.estimation.kalman import log_normal, predict_, update_row_, update_state_
+from can_imm.estimation.noise import NoiseState, load, store_, uniform
 from can_imm.estimation.particles import (
     N_COLUMNS,
     PARTICLE_DTYPE,
@@ -156,8 +163,10 @@ WORK_DTYPE = np.dtype(
 """Scratch of the kernels; one record serves all objects."""
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def mix_(bank: Any, obj: Any, work: Any, j: int, m: int) -> None:  # pragma: no cover - compiled
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def mix_(
+    n: int, bank: Any, obj: Any, work: Any, j: int, m: int
+) -> None:  # pragma: no cover - compiled
     """Interaction (15)(16) for target mode j: mixed mean and covariance into work.x[j], work.P[j].
 
     Where bit s of ``entry_sources[i, j]`` is set, state s of source i is replaced by the mode's
@@ -167,12 +176,14 @@ def mix_(bank: Any, obj: Any, work: Any, j: int, m: int) -> None:  # pragma: no 
     the same would only blur a lane change, whose speed builds up within the interval.)
     ``work.w`` holds the mixing weights.
     """
-    n_modes, n = bank.n_modes, bank.n_states
+    n_modes = bank.n_modes
     tau = m * bank.step_s
     n_sources = 0
+    entered = 0  # states that are replaced for any source
     for i in range(n_modes):
         if work.w[i] > 0.0:
             work.source[n_sources] = i
+            entered |= bank.entry_sources[i, j]
             n_sources += 1
     for s in range(n):
         v = 0.0
@@ -195,13 +206,15 @@ def mix_(bank: Any, obj: Any, work: Any, j: int, m: int) -> None:  # pragma: no 
             for k in range(n_sources):
                 i = work.source[k]
                 p = work.sx[k, s] * work.sx[k, t]
-                if not bank.entry_sources[i, j] & replaced:
+                if not entered & replaced or not bank.entry_sources[i, j] & replaced:
                     p += obj.P[i, s, t]
                 elif s == t:
                     p += bank.entry_var[j, s]
                 v += work.w[i] * p
             work.P[j, s, t] = v
             work.P[j, t, s] = v
+    if not entered & SPEED_STEP:
+        return
     for k in range(n_sources):
         i = work.source[k]
         if bank.entry_sources[i, j] & (SPEED_STEP | 1 << X) != SPEED_STEP:
@@ -221,8 +234,10 @@ def mix_(bank: Any, obj: Any, work: Any, j: int, m: int) -> None:  # pragma: no 
             work.P[j, X, s] = work.P[j, s, X]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def transitions_(bank: Any, obj: Any, work: Any, m: int) -> None:  # pragma: no cover - compiled
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def transitions_(
+    n: int, bank: Any, obj: Any, work: Any, m: int
+) -> None:  # pragma: no cover - compiled
     """State-dependent transition probabilities of this cycle into work.Pi.
 
     A bound with ``mass`` is a region outside of which the mode does not exist.  The probability of
@@ -231,23 +246,13 @@ def transitions_(bank: Any, obj: Any, work: Any, m: int) -> None:  # pragma: no 
     loses nothing to a mode it cannot reach.  States that the entry replaces do not count.
     ``work.mu`` holds the probabilities of the modes that are present.
     """
-    n_modes, n = bank.n_modes, bank.n_states
+    n_modes = bank.n_modes
     for i in range(n_modes):
         for j in range(n_modes):
             work.Pi[i, j] = bank.Pi[m, i, j]
         if work.mu[i] == 0.0:
             continue
-        for s in range(n):
-            v = 0.0
-            q = bank.Q[m, i, s, s]
-            for k in range(n):
-                f = bank.F[m, i, s, k]
-                if f != 0.0:
-                    v += f * obj.x[i, k]
-                    for t in range(n):
-                        q += f * bank.F[m, i, s, t] * obj.P[i, k, t]
-            work.tx[s] = v
-            work.var[s] = q
+        done = 0  # bits of the states that have been moved on
         total = 0.0
         for j in range(n_modes):
             log_mass = 0.0
@@ -255,21 +260,34 @@ def transitions_(bank: Any, obj: Any, work: Any, m: int) -> None:  # pragma: no 
                 s = bank.bound_state[j, c]
                 if not bank.bound_mass[j, c] or (bank.entry_sources[i, j] >> s & 1):
                     continue
+                if not done >> s & 1:
+                    done |= 1 << s
+                    v = 0.0
+                    q = bank.Q[m, i, s, s]
+                    for k in range(n):
+                        f = bank.F[m, i, s, k]
+                        if f != 0.0:
+                            v += f * obj.x[i, k]
+                            for t in range(n):
+                                q += f * bank.F[m, i, s, t] * obj.P[i, k, t]
+                    work.tx[s] = v
+                    work.var[s] = q
                 base = reference(
                     bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, work.tx[s]
                 )
                 sd = math.sqrt(max(work.var[s], bank.var_floor))
-                log_mass += truncated_normal(
+                log_mass += normal_mass(
                     (base + bank.bound_lower[j, c] - work.tx[s]) / sd,
                     (base + bank.bound_upper[j, c] - work.tx[s]) / sd,
-                )[0]
-            work.Pi[i, j] *= math.exp(log_mass)
+                )
+            if log_mass != 0.0:
+                work.Pi[i, j] *= math.exp(log_mass)
             total += work.Pi[i, j]
         for j in range(n_modes):
             work.Pi[i, j] = work.Pi[i, j] / total if total > 1e-30 else bank.Pi[m, i, j]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def reference(
     kind: int, lanes: FloatArray, width: float, y: float
 ) -> float:  # pragma: no cover - compiled
@@ -280,12 +298,13 @@ def reference(
     """
     if kind == FIXED:
         return 0.0
-    return float(min(max(math.floor(y / width + 0.5), lanes[0]), lanes[1]) * width)
+    lane: float = min(max(math.floor(y / width + 0.5), lanes[0]), lanes[1])
+    return lane * width
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def constrain_soft_(
-    bank: Any, j: int, x: FloatArray, P: FloatArray, work: Any
+    n: int, bank: Any, j: int, x: FloatArray, P: FloatArray, work: Any
 ) -> float:  # pragma: no cover - compiled
     """Apply the soft equality rows of mode j as pseudo-measurements (22)(23); 0, or NaN on failure.
 
@@ -293,7 +312,6 @@ def constrain_soft_(
     satisfies the constraint, and has another dimension for each mode.
     """
     bad = 0.0
-    n = bank.n_states
     for c in range(bank.n_soft[j]):
         s = bank.soft_state[j, c]
         value = bank.soft_value[j, c] + reference(
@@ -303,7 +321,7 @@ def constrain_soft_(
     return bad
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def correct_(
     n: int,
     x: FloatArray,
@@ -349,8 +367,35 @@ def correct_(
     return log_l
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def mass_(
+    n: int, x: FloatArray, P: FloatArray, n_bounds: int, state: Any, floor: float, work: Any
+) -> float:  # pragma: no cover - compiled
+    """Log of the mass of N(x, P) inside all bounds of a mode, one after the other; x, P are kept.
+
+    Args:
+        state: (n_bounds,) the bounded states; their intervals are in work.lower and work.upper.
+    """
+    if n_bounds == 0:
+        return 0.0
+    for s in range(n):
+        work.tx[s] = x[s]
+        for t in range(n):
+            work.tP[s, t] = P[s, t]
+    log_mass = 0.0
+    last = n_bounds - 1
+    for c in range(last):
+        log_mass += truncate_(
+            n, work.tx, work.tP, state[c], work.lower[c], work.upper[c], floor, work.row
+        )
+    return log_mass + interval_mass(
+        work.tx, work.tP, state[last], work.lower[last], work.upper[last]
+    )
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def update_mode_(
+    n: int,
     bank: Any,
     work: Any,
     j: int,
@@ -362,50 +407,37 @@ def update_mode_(
     """Constraint and measurement update of Gaussian mode j in work.x[j], work.P[j]; its log L."""
     x = work.x[j]
     P = work.P[j]
-    n = bank.n_states
-    log_l = constrain_soft_(bank, j, x, P, work)
+    log_l = constrain_soft_(n, bank, j, x, P, work)
     n_bounds = bank.n_bounds[j]
     prior = 0.0
-    if n_bounds > 0:
-        for s in range(n):
-            work.tx[s] = x[s]
-            for t in range(n):
-                work.tP[s, t] = P[s, t]
-        for c in range(n_bounds):
-            s = bank.bound_state[j, c]
-            # The lane is that of the prior, for the posterior too.
-            base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, x[s])
-            work.lower[c] = base + bank.bound_lower[j, c]
-            work.upper[c] = base + bank.bound_upper[j, c]
-            prior += truncate_(
-                n, work.tx, work.tP, s, work.lower[c], work.upper[c], bank.var_floor, work.row
-            )
+    for c in range(n_bounds):
+        s = bank.bound_state[j, c]
+        # The lane is that of the prior, for the posterior too.
+        base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, x[s])
+        work.lower[c] = base + bank.bound_lower[j, c]
+        work.upper[c] = base + bank.bound_upper[j, c]
+    prior = mass_(n, x, P, n_bounds, bank.bound_state[j], bank.var_floor, work)
     log_l += correct_(n, x, P, z, r, valid, age, work.h, work.row)
     if prior < LOG_MASS_FLOOR + 1.0:
         return LOG_FLOOR  # the constraint contradicts the past beyond what numbers can tell
     posterior = 0.0
-    if n_bounds > 0 and bank.is_projected[j]:
+    if bank.is_projected[j]:
         # The mass needs the Gaussian before it is projected.
-        for s in range(n):
-            work.tx[s] = x[s]
-            for t in range(n):
-                work.tP[s, t] = P[s, t]
+        posterior = mass_(n, x, P, n_bounds, bank.bound_state[j], bank.var_floor, work)
     for c in range(n_bounds):
         s = bank.bound_state[j, c]
         lower = work.lower[c]
         upper = work.upper[c]
-        if bank.is_projected[j]:
-            posterior += truncate_(n, work.tx, work.tP, s, lower, upper, bank.var_floor, work.row)
-            if x[s] < lower:
-                project_(n, x, P, s, lower, bank.var_floor, work.row)
-            elif x[s] > upper:
-                project_(n, x, P, s, upper, bank.var_floor, work.row)
-        else:
+        if not bank.is_projected[j]:
             posterior += truncate_(n, x, P, s, lower, upper, bank.var_floor, work.row)
+        elif x[s] < lower:
+            project_(n, x, P, s, lower, bank.var_floor, work.row)
+        elif x[s] > upper:
+            project_(n, x, P, s, upper, bank.var_floor, work.row)
     return log_l + posterior - prior
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def keep_combined_(
     n: int, obj: Any, x: FloatArray, P: FloatArray
 ) -> None:  # pragma: no cover - compiled
@@ -430,7 +462,7 @@ def update_particles_(
     particles: FloatArray,
     spare: FloatArray,
     weights: FloatArray,
-    rng: Any,
+    noise: NoiseState,
 ) -> float:  # pragma: no cover - compiled
     """Whole cycle of the particle mode j: interact by drawing from the sources, move, weigh,
     resample; moments into work.x[j], work.P[j]; log of mean_i[phi_i g_i].
@@ -445,7 +477,9 @@ def update_particles_(
     # systematic allocation of the particles to the sources
     done = 0
     cumulative = 0.0
-    u = rng.random()
+    words = load(noise)
+    u, words = uniform(words)
+    store_(noise, words)
     for i in range(n_modes):
         cumulative += work.w[i]
         upto = min(int(cumulative * total + u), total) if i < n_modes - 1 else total
@@ -460,9 +494,9 @@ def update_particles_(
                     spare[done + k, c] = particles[a, c]
         else:
             cholesky4_(obj.P[i], work.L)
-            enter_(spare, done, count, obj.x[i], work.L, bank.particle, rng)
+            enter_(spare, done, count, obj.x[i], work.L, bank.particle, noise)
         done = upto
-    propagate_(spare, m * bank.step_s, bank.particle, rng)
+    propagate_(spare, m * bank.step_s, bank.particle, noise)
     log_l = weigh_(spare, weights, z, r, valid, age, bank.particle)
     for s in range(n):
         for t in range(n):
@@ -477,11 +511,14 @@ def update_particles_(
     for s in range(4, n):
         x[s] = 0.0
         P[s, s] = bank.birth_std[s] ** 2
-    resample_(spare, weights, particles, total, rng.random())
+    words = load(noise)
+    u, words = uniform(words)
+    store_(noise, words)
+    resample_(spare, weights, particles, total, u)
     return log_l
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def present_(bank: Any, obj: Any, w: FloatArray) -> None:  # pragma: no cover - compiled
     """Mode probabilities without those at the floor, normalised, into w (M,).
 
@@ -496,10 +533,10 @@ def present_(bank: Any, obj: Any, w: FloatArray) -> None:  # pragma: no cover - 
         w[j] /= total
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def combine_(bank: Any, obj: Any, work: Any) -> None:  # pragma: no cover - compiled
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def combine_(n: int, bank: Any, obj: Any, work: Any) -> None:  # pragma: no cover - compiled
     """Combined mean and covariance (19)(20) of all modes that are above the floor."""
-    n_modes, n = bank.n_modes, bank.n_states
+    n_modes = bank.n_modes
     present_(bank, obj, work.w)
     for s in range(n):
         v = 0.0
@@ -510,33 +547,35 @@ def combine_(bank: Any, obj: Any, work: Any) -> None:  # pragma: no cover - comp
         for t in range(s + 1):
             v = 0.0
             for j in range(n_modes):
-                v += work.w[j] * (
-                    obj.P[j, s, t] + (obj.x[j, s] - obj.mean[s]) * (obj.x[j, t] - obj.mean[t])
-                )
+                if work.w[j] > 0.0:
+                    v += work.w[j] * (
+                        obj.P[j, s, t] + (obj.x[j, s] - obj.mean[s]) * (obj.x[j, t] - obj.mean[t])
+                    )
             obj.cov[s, t] = v
             obj.cov[t, s] = v
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def normalise_(
     n: int, mu: FloatArray, log_l: FloatArray, c: FloatArray, floor: float
 ) -> bool:  # pragma: no cover - compiled
     """mu_j proportional to exp(log_l_j) c_j with the log-sum-exp shift, then the floor.
+
+    ``c`` is used up.
 
     Returns:
         False if no mode has a finite likelihood (mu untouched).
     """
     top = -np.inf
     for j in range(n):
-        v = log_l[j] + (math.log(c[j]) if c[j] > 0.0 else LOG_FLOOR)
-        if v > top:
-            top = v
+        c[j] = log_l[j] + (math.log(c[j]) if c[j] > 0.0 else LOG_FLOOR)
+        if c[j] > top:
+            top = c[j]
     if not (top > LOG_FLOOR / 2 and top < np.inf):
         return False
     s = 0.0
     for j in range(n):
-        v = log_l[j] + (math.log(c[j]) if c[j] > 0.0 else LOG_FLOOR)
-        mu[j] = math.exp(v - top) if v > LOG_FLOOR / 2 else 0.0
+        mu[j] = math.exp(c[j] - top) if c[j] > LOG_FLOOR / 2 else 0.0
         s += mu[j]
     t = 0.0
     for j in range(n):
@@ -595,8 +634,9 @@ def surprise(
     return d
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def cycle_(
+    n: int,
     bank: Any,
     obj: Any,
     work: Any,
@@ -609,7 +649,7 @@ def cycle_(
     particles: FloatArray,
     spare: FloatArray,
     weights: FloatArray,
-    rng: Any,
+    noise: NoiseState,
 ) -> int:  # pragma: no cover - compiled
     """One IMM cycle of one object, in place.
 
@@ -621,17 +661,17 @@ def cycle_(
         gate: z is an outlier if its `surprise` is larger; inf switches the gate off.
         particles: (N, 7) the object's particles; N may be 0 in a bank without a particle mode.
         spare: (N, 7) scratch.  weights: (N,) scratch.
-        rng: numpy Generator, used by the particle mode only.
+        noise: state of the random numbers, used by the particle mode only.
 
     Returns:
         OK; OUTLIER or FAILED with the object as it was before (a failed mode alone gets the floor).
     """
-    n_modes, n = bank.n_modes, bank.n_states
+    n_modes = bank.n_modes
     if surprise(bank, obj, m, z, r, valid, age) > gate:
         return OUTLIER
     work.lane_width = obj.lane_width
     present_(bank, obj, work.mu)
-    transitions_(bank, obj, work, m)
+    transitions_(n, bank, obj, work, m)
     for j in range(n_modes):
         c = 0.0
         for i in range(n_modes):
@@ -646,12 +686,12 @@ def cycle_(
             keep_combined_(n, obj, work.x[j], work.P[j])
         elif bank.is_particle[j]:
             log_l = update_particles_(
-                bank, obj, work, j, m, z, r, valid, age, particles, spare, weights, rng
+                bank, obj, work, j, m, z, r, valid, age, particles, spare, weights, noise
             )
         else:
-            mix_(bank, obj, work, j, m)
+            mix_(n, bank, obj, work, j, m)
             predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
-            log_l = update_mode_(bank, work, j, z, r, valid, age)
+            log_l = update_mode_(n, bank, work, j, z, r, valid, age)
         if not log_l > LOG_FLOOR:
             # Also a numeric failure: what is left of its state must not reach the others.
             keep_combined_(n, obj, work.x[j], work.P[j])
@@ -664,7 +704,7 @@ def cycle_(
             obj.x[j, s] = work.x[j, s]
             for t in range(n):
                 obj.P[j, s, t] = work.P[j, s, t]
-    combine_(bank, obj, work)
+    combine_(n, bank, obj, work)
     learn_lane_(bank, obj)
     return OK
 
@@ -705,12 +745,12 @@ def birth_(
                 )
                 sd = math.sqrt(r[s])
                 work.c[j] *= math.exp(
-                    truncated_normal(
+                    normal_mass(
                         (base + bank.bound_lower[j, c] - z[s]) / sd,
                         (base + bank.bound_upper[j, c] - z[s]) / sd,
-                    )[0]
+                    )
                 )
-        log_l = update_mode_(bank, work, j, z, r, valid, age)
+        log_l = update_mode_(n, bank, work, j, z, r, valid, age)
         if bank.is_particle[j]:
             log_l = LOG_FLOOR  # entered from another mode, never born into
         obj.log_l[j] = log_l if log_l > LOG_FLOOR else LOG_FLOOR
@@ -722,7 +762,7 @@ def birth_(
             obj.x[j, s] = work.x[j, s]
             for t in range(n):
                 obj.P[j, s, t] = work.P[j, s, t]
-    combine_(bank, obj, work)
+    combine_(n, bank, obj, work)
     return OK
 
 
@@ -777,7 +817,7 @@ def process_scan_(
     particles: FloatArray,
     spare: FloatArray,
     weights: FloatArray,
-    rng: Any,
+    noise: NoiseState,
     status: Any,
 ) -> None:  # pragma: no cover - compiled
     """One scan: the cycle, or the birth, of all its objects in one call.
@@ -787,7 +827,7 @@ def process_scan_(
         n: rows in use.  slot: (N,) int32, -1 for none.
         steps: (N,) int32, steps since the slot's last measurement; -1 for a birth.
         z, r: (N, 4) measured values and variances.  valid: (N, 4) bool.
-        age, gate, spare, weights, rng: as for `cycle_`.
+        age, gate, spare, weights, noise: as for `cycle_`.
         particles: (capacity, n_particles, 7).
         status: (N,) int8, written: OK, OUTLIER or FAILED.
     """
@@ -797,8 +837,10 @@ def process_scan_(
             continue
         if steps[k] < 0:
             status[k] = birth_(bank[0], objects[s], work[0], z[k], r[k], valid[k], age)
-        else:
+        elif bank[0].n_states == 4:
+            # The number of states as a constant lets the compiler unroll everything.
             status[k] = cycle_(
+                4,
                 bank[0],
                 objects[s],
                 work[0],
@@ -811,5 +853,39 @@ def process_scan_(
                 particles[s],
                 spare,
                 weights,
-                rng,
+                noise,
+            )
+        elif bank[0].n_states == 5:
+            status[k] = cycle_(
+                5,
+                bank[0],
+                objects[s],
+                work[0],
+                steps[k],
+                z[k],
+                r[k],
+                valid[k],
+                age,
+                gate,
+                particles[s],
+                spare,
+                weights,
+                noise,
+            )
+        else:
+            status[k] = cycle_(
+                bank[0].n_states,
+                bank[0],
+                objects[s],
+                work[0],
+                steps[k],
+                z[k],
+                r[k],
+                valid[k],
+                age,
+                gate,
+                particles[s],
+                spare,
+                weights,
+                noise,
             )

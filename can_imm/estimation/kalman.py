@@ -18,13 +18,13 @@ from can_imm.types import FloatArray
 LOG_2PI = math.log(2.0 * math.pi)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def log_normal(e: float, s: float) -> float:  # pragma: no cover - compiled
     """Log density of a normal deviate ``e`` with variance ``s``."""
     return -0.5 * (LOG_2PI + math.log(s) + e * e / s)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def predict_(
     n: int, x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, work: FloatArray
 ) -> None:  # pragma: no cover - compiled
@@ -36,24 +36,30 @@ def predict_(
         F: (n, n) transition.  Q: (n, n) process noise.
         work: (n + 1, n) scratch.
     """
+    # F is mostly zeros: to look is cheaper than to multiply.
     for i in range(n):
+        for j in range(n):
+            work[i, j] = 0.0
         s = 0.0
         for k in range(n):
-            s += F[i, k] * x[k]
+            f = F[i, k]
+            if f != 0.0:
+                s += f * x[k]
+                for j in range(n):
+                    work[i, j] += f * P[k, j]
         work[n, i] = s
-        for j in range(n):
-            s = 0.0
-            for k in range(n):
-                s += F[i, k] * P[k, j]
-            work[i, j] = s
     for i in range(n):
         x[i] = work[n, i]
-        for j in range(i + 1):
-            s = Q[i, j]
-            for k in range(n):
-                s += work[i, k] * F[j, k]
-            P[i, j] = s
-            P[j, i] = s
+    for j in range(n):
+        for i in range(j, n):
+            P[i, j] = Q[i, j]
+        for k in range(n):
+            f = F[j, k]
+            if f != 0.0:
+                for i in range(j, n):
+                    P[i, j] += work[i, k] * f
+        for i in range(j, n):
+            P[j, i] = P[i, j]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -100,7 +106,7 @@ def update_row_(
     return e, s
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def update_state_(
     n: int, x: FloatArray, P: FloatArray, i0: int, z: float, r: float, work: FloatArray
 ) -> tuple[float, float]:  # pragma: no cover - compiled

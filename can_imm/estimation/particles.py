@@ -16,6 +16,7 @@ import numba
 import numpy as np
 
 from can_imm.estimation.kalman import LOG_2PI
+from can_imm.estimation.noise import NoiseState, load, normal, store_, uniform
 from can_imm.types import FloatArray
 
 PX, PVX, PY, PVY, ENTRY, PEAK, LENGTH = 0, 1, 2, 3, 4, 5, 6
@@ -79,7 +80,7 @@ def cholesky4_(P: FloatArray, L: FloatArray) -> None:  # pragma: no cover - comp
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def enter_(
-    p: FloatArray, first: int, count: int, x: FloatArray, L: FloatArray, par: Any, rng: Any
+    p: FloatArray, first: int, count: int, x: FloatArray, L: FloatArray, par: Any, noise: NoiseState
 ) -> None:  # pragma: no cover - compiled
     """Draw ``count`` particles that enter the mode from a Gaussian N(x, L L').
 
@@ -87,50 +88,61 @@ def enter_(
         p: (N, 7) particles; rows first .. first + count - 1 are written.
         x: (>= 4,) mean.  L: (4, 4) lower Cholesky factor.
         par: record of `PARTICLE_DTYPE`.
-        rng: numpy Generator.
+        noise: state of the random numbers.
     """
+    s = load(noise)
+    # two independent normal terms of vy in one draw
+    vy3 = math.sqrt(L[3, 3] ** 2 + par.entry_vy_std**2)
     for a in range(first, first + count):
-        e0 = rng.standard_normal()
-        e1 = rng.standard_normal()
-        e2 = rng.standard_normal()
-        e3 = rng.standard_normal()
+        e0, s = normal(s)
+        e1, s = normal(s)
+        e2, s = normal(s)
+        e3, s = normal(s)
         p[a, PX] = x[0] + L[0, 0] * e0
         p[a, PVX] = x[1] + L[1, 0] * e0 + L[1, 1] * e1
         p[a, PY] = x[2] + L[2, 0] * e0 + L[2, 1] * e1 + L[2, 2] * e2
-        p[a, PVY] = x[3] + L[3, 0] * e0 + L[3, 1] * e1 + L[3, 2] * e2 + L[3, 3] * e3
-        p[a, PVY] += par.entry_vy_std * rng.standard_normal()
+        p[a, PVY] = x[3] + L[3, 0] * e0 + L[3, 1] * e1 + L[3, 2] * e2 + vy3 * e3
         if par.absolute:
             p[a, ENTRY] = par.entry
             p[a, PEAK] = par.peak_low
             p[a, LENGTH] = par.length_low
         else:
-            peak = par.peak_low + (par.peak_high - par.peak_low) * rng.random()
-            ratio = par.length_low + (par.length_high - par.length_low) * rng.random()
+            u0, s = uniform(s)
+            u1, s = uniform(s)
+            u2, s = uniform(s)
+            peak = par.peak_low + (par.peak_high - par.peak_low) * u0
+            ratio = par.length_low + (par.length_high - par.length_low) * u1
             length = peak * ratio
             # The mode is feasible from f_min on: enter between there and the end of the plateau, so
             # that a speed step is an entry as well as a ramp.
             begin = par.up * par.f_min / peak
-            u = begin + (par.down - begin) * rng.random()
+            u = begin + (par.down - begin) * u2
             p[a, PEAK] = peak
             p[a, LENGTH] = length
             p[a, ENTRY] = p[a, PX] - u * length
+    store_(noise, s)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def propagate_(
-    p: FloatArray, tau: float, par: Any, rng: Any
+    p: FloatArray, tau: float, par: Any, noise: NoiseState
 ) -> None:  # pragma: no cover - compiled
     """Move particles by ``tau`` seconds: x with its speed, vx onto the profile, y and vy freely."""
     sx = par.std_x * math.sqrt(tau)
     sv = par.std_profile
     sy = math.sqrt(par.q_vy * tau)
+    s = load(noise)
     for a in range(p.shape[0]):
-        w = sy * rng.standard_normal()
-        p[a, PX] += tau * p[a, PVX] + sx * rng.standard_normal()
+        e0, s = normal(s)
+        e1, s = normal(s)
+        e2, s = normal(s)
+        w = sy * e0
+        p[a, PX] += tau * p[a, PVX] + sx * e1
         f = profile_speed(p[a, PX] - p[a, ENTRY], p[a, PEAK], p[a, LENGTH], par.up, par.down)
-        p[a, PVX] = f + sv * rng.standard_normal()
+        p[a, PVX] = f + sv * e2
         p[a, PY] += tau * (p[a, PVY] + 0.5 * w)
         p[a, PVY] += w
+    store_(noise, s)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -147,6 +159,7 @@ def weigh_(
         log of mean_i[phi_i g_i]; -inf if no particle is feasible.
     """
     n = p.shape[0]
+    log_r = math.log(r[0]), math.log(r[1]), math.log(r[2]), math.log(r[3])
     top = -np.inf
     for a in range(n):
         f = profile_speed(p[a, PX] - p[a, ENTRY], p[a, PEAK], p[a, LENGTH], par.up, par.down)
@@ -158,14 +171,14 @@ def weigh_(
                     e = z[c] - p[a, c]
                     if c == 0 or c == 2:
                         e += age * p[a, c + 1]
-                    lw -= 0.5 * (e * e / r[c] + math.log(r[c]) + LOG_2PI)
+                    lw -= 0.5 * (e * e / r[c] + log_r[c] + LOG_2PI)
         logw[a] = lw
         top = max(top, lw)
     if top == -np.inf:
         return top
     s = 0.0
     for a in range(n):
-        logw[a] = math.exp(logw[a] - top)
+        logw[a] = math.exp(logw[a] - top) if logw[a] > -np.inf else 0.0
         s += logw[a]
     for a in range(n):
         logw[a] /= s
@@ -177,18 +190,28 @@ def moments_(
     p: FloatArray, w: FloatArray, x: FloatArray, P: FloatArray
 ) -> None:  # pragma: no cover - compiled
     """Weighted mean and covariance of the four states; ``w`` sums to 1."""
+    # One pass each, so that the sums run beside one another and not after one another.
     for c in range(4):
-        s = 0.0
-        for a in range(p.shape[0]):
-            s += w[a] * p[a, c]
-        x[c] = s
+        x[c] = 0.0
+        for d in range(4):
+            P[c, d] = 0.0
+    m0 = m1 = m2 = m3 = 0.0
+    for a in range(p.shape[0]):
+        m0 += w[a] * p[a, 0]
+        m1 += w[a] * p[a, 1]
+        m2 += w[a] * p[a, 2]
+        m3 += w[a] * p[a, 3]
+    x[0], x[1], x[2], x[3] = m0, m1, m2, m3
+    for a in range(p.shape[0]):
+        if w[a] == 0.0:
+            continue
+        for c in range(4):
+            wc = w[a] * (p[a, c] - x[c])
+            for d in range(c + 1):
+                P[c, d] += wc * (p[a, d] - x[d])
     for c in range(4):
-        for d in range(c + 1):
-            s = 0.0
-            for a in range(p.shape[0]):
-                s += w[a] * (p[a, c] - x[c]) * (p[a, d] - x[d])
-            P[c, d] = s
-            P[d, c] = s
+        for d in range(c):
+            P[d, c] = P[c, d]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -113,7 +113,8 @@ class DetectorNode:
             self._status_ns = t_ns
             answers.append(self._encoder.status(t_ns, self._status(t_ns)))
         if self._channel is not None:
-            answers = [frame._replace(channel=self._channel) for frame in answers]
+            channel = self._channel
+            answers = [Frame(t_ns, frame.id, frame.data, channel) for frame in answers]
         return answers
 
     def farewell(self, t_ns: int) -> list[Frame]:

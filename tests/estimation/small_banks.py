@@ -9,6 +9,7 @@ from oracles.gaussian import random_covariance
 from oracles.imm import Imm, Mode
 
 from can_imm.estimation import imm
+from can_imm.estimation.noise import noise_state
 from can_imm.estimation.particles import N_COLUMNS
 
 
@@ -78,7 +79,7 @@ class Runner:
         self.particles = np.zeros((capacity, n_particles, N_COLUMNS))
         self.spare = np.zeros((n_particles, N_COLUMNS))
         self.weights = np.zeros(n_particles)
-        self.rng = np.random.default_rng(seed)
+        self.noise = noise_state(np.random.default_rng(seed))
 
     def scan(
         self,
@@ -98,7 +99,7 @@ class Runner:
             self.bank, self.objects, self.work, n, np.array(slots, np.int32),
             np.array(steps, np.int32), z, np.broadcast_to(r, z.shape).copy(),
             np.ones(z.shape, np.bool_) if valid is None else np.array(valid).reshape(n, 4),
-            age, gate, self.particles, self.spare, self.weights, self.rng, status,
+            age, gate, self.particles, self.spare, self.weights, self.noise, status,
         )  # fmt: skip
         return status
 

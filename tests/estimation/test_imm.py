@@ -135,7 +135,7 @@ def test_each_entry_state_has_its_own_sources() -> None:
     runner = Runner(bank, 1)
     copy_state(Imm([], xs, Ps, w), runner.objects[0])
     runner.work[0]["w"][:3] = w
-    imm.mix_(bank[0], runner.objects[0], runner.work[0], 2, 0)
+    imm.mix_(bank[0]["n_states"], bank[0], runner.objects[0], runner.work[0], 2, 0)
     for i, s, mean, variance in ((0, 1, 0.7, 0.3), (1, 3, -0.2, 0.1)):
         xs[i][s] = mean
         Ps[i][s, :] = Ps[i][:, s] = 0.0
@@ -169,7 +169,7 @@ def test_a_new_speed_sets_in_at_any_instant_of_the_interval(
     runner = Runner(bank, 1)
     copy_state(Imm([], [x, x], [P, P], np.array([1.0, 0.0])), runner.objects[0])
     runner.work[0]["w"][:2] = [1.0, 0.0]
-    imm.mix_(record, runner.objects[0], runner.work[0], 1, 50)
+    imm.mix_(record["n_states"], record, runner.objects[0], runner.work[0], 1, 50)
     mean, cov = enter(x, P, entry, 0.5)
     np.testing.assert_allclose(runner.work[0]["x"][1, :5], mean, rtol=1e-12)
     np.testing.assert_allclose(runner.work[0]["P"][1, :5, :5], cov, rtol=1e-12, atol=1e-14)
@@ -201,7 +201,9 @@ def test_the_mass_of_a_region_moves_the_transition() -> None:
     add_bound(runner.bank, 2, 0, -np.inf, 0.3, mass=True)
     add_bound(runner.bank, 2, 1, -1.0, 1.0)  # not a matter of the transition
     runner.work[0]["mu"][:3] = oracle.mu
-    imm.transitions_(runner.bank[0], runner.objects[0], runner.work[0], 5)
+    imm.transitions_(
+        runner.bank[0]["n_states"], runner.bank[0], runner.objects[0], runner.work[0], 5
+    )
     expected = Pi.copy()
     for i, mode in enumerate(oracle.modes):
         x = mode.F @ oracle.x[i]
@@ -219,7 +221,7 @@ def test_a_state_that_the_entry_replaces_does_not_count_in_the_transition() -> N
     record["entry_mean"][1, 1], record["entry_var"][1, 1] = 55.0, 1.0
     record["entry_sources"][0, 1] = 1 << 1
     runner.work[0]["mu"][:2] = 0.5
-    imm.transitions_(record, runner.objects[0], runner.work[0], 5)
+    imm.transitions_(record["n_states"], record, runner.objects[0], runner.work[0], 5)
     np.testing.assert_allclose(runner.work[0]["Pi"][0, :2], Pi[0], rtol=1e-12)
     assert runner.work[0]["Pi"][1, 1] < 1e-12, "staying counts: nothing is replaced there"
 
@@ -307,7 +309,7 @@ def test_combined_covariance_is_one(seed: int, spread: float) -> None:
     oracle = Imm([], xs, Ps, rng.dirichlet(np.ones(n_modes)))
     copy_state(oracle, obj[0])
     obj["mean"], obj["cov"] = np.nan, np.nan
-    imm.combine_(bank[0], obj[0], work[0])
+    imm.combine_(bank[0]["n_states"], bank[0], obj[0], work[0])
     mean, cov = oracle.combined()
     np.testing.assert_allclose(obj[0]["mean"][:n], mean, rtol=1e-9, atol=1e-9 * spread)
     np.testing.assert_allclose(obj[0]["cov"][:n, :n], cov, rtol=1e-9, atol=1e-9 * spread**2)

@@ -26,7 +26,7 @@ def log_likelihood(bank, x, P, z, r, valid=VALID_2, age=0.0, lane_width=3.0):
     work = np.zeros(1, imm.WORK_DTYPE)
     work[0]["x"][0, :n], work[0]["P"][0, :n, :n] = x, P
     work[0]["lane_width"] = lane_width
-    log_l = imm.update_mode_(bank[0], work[0], 0, z, r, valid, age)
+    log_l = imm.update_mode_(bank[0]["n_states"], bank[0], work[0], 0, z, r, valid, age)
     return log_l, work[0]["x"][0, :n], work[0]["P"][0, :n, :n]
 
 

@@ -15,6 +15,7 @@ from scipy.stats import multivariate_normal, norm
 from small_banks import Runner, blank
 
 from can_imm.estimation import imm, particles
+from can_imm.estimation.noise import noise_state
 from can_imm.estimation.particles import (
     ENTRY,
     LENGTH,
@@ -135,7 +136,7 @@ def test_entering_draws_from_the_source() -> None:
     par = parameters(
         absolute=0, peak_low=1.0, peak_high=3.0, length_low=1.2, length_high=2.4, entry_vy_std=0.5
     )
-    enter_(p, 1, 40_000, x, L, par, rng)
+    enter_(p, 1, 40_000, x, L, par, noise_state(rng))
     assert (p[[0, -1]] == 77.0).all()
     p = p[1:-1]
     P[3, 3] += 0.25
@@ -169,7 +170,7 @@ def test_motion() -> None:
     tau, n = 0.1, 40_000
     p = np.tile([51.0, 1.5, 1.0, 0.8, 50.0, 2.1, 3.75], (n, 1))
     par = parameters()
-    particles.propagate_(p, tau, par, rng)
+    particles.propagate_(p, tau, par, noise_state(rng))
     assert p[:, PX].mean() == pytest.approx(51.15, abs=1e-3)
     assert p[:, PX].var() == pytest.approx(0.05**2 * tau, rel=0.05)
     residual = p[:, PVX] - trapezoid(p[:, PX])

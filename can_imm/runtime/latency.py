@@ -1,0 +1,288 @@
+"""How long an answer takes, stage by stage: stamps around a node's own parts.
+
+All stamps are `time.perf_counter_ns`.  A round is one scan: sent, read, answered, handed over::
+
+    sent -receive-> read -wait-> due -late-> start -decode-> -estimate-> -encode-> -send-> over
+
+``processing`` is decode to send; ``response`` is the whole way back to the sender less the wait for
+the next fixed step, which is what a bare echo node's round trip is to be compared with.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from can_imm.bus.echo import ECHO_ANSWER, ECHO_REQUEST
+from can_imm.bus.encoder import OUTPUT_IDS, STATUS_ID
+from can_imm.bus.frame import Frame
+from can_imm.runtime.clock import Clock
+from can_imm.runtime.feeds import FrameSource
+from can_imm.runtime.loop import Node, Sink
+
+if TYPE_CHECKING:
+    from can_imm.detector import Detector
+    from can_imm.types import Scan
+
+STAGES = ("receive", "wait", "late", "decode", "estimate", "encode", "send", "processing",
+          "end_to_end", "response")  # fmt: skip
+
+QUANTILES = {"p50_us": 0.5, "p90_us": 0.9, "p99_us": 0.99, "p999_us": 0.999}
+
+
+class Histogram:
+    """Durations in bins 1 % wide, from 0.1 us to 100 s; constant memory for a run of any length.
+
+    Attributes:
+        counts: entries by bin.
+        max_ns: the longest duration [ns], exactly.
+    """
+
+    LEAST_NS = 100.0
+    _WIDTH = math.log(1.01)
+    BINS = int(math.log(1e11 / LEAST_NS) / _WIDTH) + 1
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all entries."""
+        self.counts = [0] * self.BINS
+        self.n = 0
+        self.max_ns = 0
+
+    def add(self, duration_ns: int) -> None:
+        """Enter a duration [ns]."""
+        ratio = max(duration_ns / self.LEAST_NS, 1.0)
+        self.counts[min(int(math.log(ratio) / self._WIDTH), self.BINS - 1)] += 1
+        self.n += 1
+        self.max_ns = max(self.max_ns, duration_ns)
+
+    def quantile_ns(self, q: float) -> float:
+        """Duration [ns] that a fraction ``q`` does not exceed, to 1 %; 0 if there is none."""
+        wanted, seen = q * self.n, 0
+        for i, count in enumerate(self.counts):
+            seen += count
+            if count and seen >= wanted:
+                return min(self.edge_ns(i + 1), float(self.max_ns))
+        return 0.0
+
+    @classmethod
+    def edge_ns(cls, i: int) -> float:
+        """Lower edge of bin ``i`` [ns]."""
+        return cls.LEAST_NS * math.exp(i * cls._WIDTH)
+
+    def summary(self) -> dict[str, float]:
+        """Quantiles and maximum [us]."""
+        values = {name: self.quantile_ns(q) / 1e3 for name, q in QUANTILES.items()}
+        return {**values, "max_us": self.max_ns / 1e3}
+
+
+class Stamps(NamedTuple):
+    """When what happened to one scan in the node [ns]."""
+
+    read: int
+    due: int
+    start: int
+    decoded: int
+    estimated: int
+    encoded: int
+    sent: int
+
+
+class Probe:
+    """Stamps a detector node from outside: wrap its source, detector, node and sink.
+
+    Attributes:
+        finished: stamps of the latest scans that were answered.
+        lateness: of every step's begin.
+    """
+
+    def __init__(self, clock: Clock, guard_ns: int, sensor_ids: frozenset[int]) -> None:
+        self.finished: deque[Stamps] = deque(maxlen=64)
+        self.lateness = Histogram()
+        self._clock = clock
+        self._guard_ns = guard_ns
+        self._sensor_ids = sensor_ids
+        self._read = self._due = self._start = self._decoded = self._estimated = 0
+        self._encoded = self._sent = 0
+        self._has_scan = False
+
+    def source(self, source: FrameSource) -> FrameSource:
+        """Stamp the sensor's frames when they are read."""
+        return _Source(self, source)
+
+    def detector(self, detector: Detector) -> Any:
+        """Stamp begin and end of the detector's work; everything else passes through."""
+        return _Detector(self, detector)
+
+    def node(self, node: Node) -> Node:
+        """Stamp begin and end of a step."""
+        return _Node(self, node)
+
+    def sink(self, sink: Sink) -> Sink:
+        """Stamp every frame that was handed over."""
+        return _Sink(self, sink)
+
+    def frame_read(self, frame: Frame) -> None:
+        if frame.id in self._sensor_ids:
+            self._read = time.perf_counter_ns()
+
+    def step_begins(self, t_ns: int) -> None:
+        self._close()
+        late_ns = self._clock.now_ns() - t_ns - self._guard_ns
+        self._start = time.perf_counter_ns()
+        self._due = self._start - late_ns
+        self.lateness.add(late_ns)
+
+    def detector_begins(self, scan: Scan | None) -> None:
+        self._has_scan = scan is not None
+        self._decoded = time.perf_counter_ns()
+
+    def detector_ends(self) -> None:
+        self._estimated = time.perf_counter_ns()
+
+    def step_ends(self) -> None:
+        self._encoded = time.perf_counter_ns()
+
+    def frame_sent(self) -> None:
+        self._sent = time.perf_counter_ns()
+
+    def _close(self) -> None:
+        """The last frame of a step is known when the next step begins."""
+        if self._has_scan:
+            self._has_scan = False
+            self.finished.append(
+                Stamps(self._read, self._due, self._start, self._decoded, self._estimated,
+                       self._encoded, self._sent)
+            )  # fmt: skip
+
+
+class _Source:
+    def __init__(self, probe: Probe, source: FrameSource) -> None:
+        self._probe, self._source = probe, source
+
+    def recv(self, timeout_s: float) -> Frame | None:
+        frame = self._source.recv(timeout_s)
+        if frame is not None:
+            self._probe.frame_read(frame)
+        return frame
+
+
+class _Detector:
+    def __init__(self, probe: Probe, detector: Detector) -> None:
+        self._probe, self._detector = probe, detector
+        self.reports, self.counts = detector.reports, detector.counts
+
+    @property
+    def n_tracked(self) -> int:
+        return self._detector.n_tracked
+
+    def step(self, t_ns: int, scan: Scan | None) -> int:
+        self._probe.detector_begins(scan)
+        n = self._detector.step(t_ns, scan)
+        self._probe.detector_ends()
+        return n
+
+
+class _Node:
+    def __init__(self, probe: Probe, node: Node) -> None:
+        self._probe, self._node = probe, node
+
+    def step(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
+        self._probe.step_begins(t_ns)
+        answers = self._node.step(t_ns, frames)
+        self._probe.step_ends()
+        return answers
+
+
+class _Sink:
+    def __init__(self, probe: Probe, sink: Sink) -> None:
+        self._probe, self._sink = probe, sink
+
+    def send(self, frame: Frame) -> None:
+        self._sink.send(frame)
+        self._probe.frame_sent()
+
+
+class Rounds:
+    """Sends scans and echo requests, waits for the answers, keeps the durations.
+
+    Attributes:
+        stages: `Histogram` by name of `STAGES`.
+        echo: round trips of the echo node.
+        lost: rounds without a complete answer in time.
+    """
+
+    TIMEOUT_S = 1.0
+
+    def __init__(self, source: FrameSource, sink: Sink, probe: Probe) -> None:
+        self.stages = {name: Histogram() for name in STAGES}
+        self.echo = Histogram()
+        self.lost = 0
+        self._source, self._sink, self._probe = source, sink, probe
+
+    def reset(self) -> None:
+        """Forget all rounds."""
+        for histogram in (*self.stages.values(), self.echo):
+            histogram.reset()
+        self.lost = 0
+
+    def scan(self, frames: Sequence[Frame], answers: int) -> None:
+        """One round: ``answers`` frames beside DetectorStatus are the complete answer."""
+        for frame in frames[:-1]:
+            self._sink.send(frame)
+        sent = time.perf_counter_ns()
+        self._sink.send(frames[-1])
+        back = self._wait(OUTPUT_IDS - {STATUS_ID}, answers)
+        stamps = self._stamps(sent)
+        if not back or stamps is None:
+            self.lost += 1
+            return
+        s = stamps
+        # A scan that comes while its step is already late waits for nothing.
+        waited = max(s.due - s.read, 0)
+        durations = (
+            s.read - sent, waited, max(s.start - max(s.due, s.read), 0), s.decoded - s.start,
+            s.estimated - s.decoded, s.encoded - s.estimated, s.sent - s.encoded,
+            s.sent - s.start, back - sent, back - sent - waited,
+        )  # fmt: skip
+        for name, duration in zip(STAGES, durations, strict=True):
+            self.stages[name].add(duration)
+
+    def bounce(self) -> None:
+        """One round trip of the echo node."""
+        sent = time.perf_counter_ns()
+        self._sink.send(Frame(0, ECHO_REQUEST, bytes(8)))
+        back = self._wait(frozenset({ECHO_ANSWER}), 1)
+        if back:
+            self.echo.add(back - sent)
+        else:
+            self.lost += 1
+
+    def _wait(self, ids: frozenset[int], count: int) -> int:
+        """When the last of ``count`` frames arrived [ns], 0 after the timeout."""
+        end = time.perf_counter() + self.TIMEOUT_S
+        while (left := end - time.perf_counter()) > 0:
+            frame = self._source.recv(left)
+            now = time.perf_counter_ns()
+            if frame is not None and frame.id in ids:
+                count -= 1
+                if count == 0:
+                    return now
+        return 0
+
+    def _stamps(self, sent: int) -> Stamps | None:
+        """Stamps of the scan that was sent at ``sent``; they come with the node's next step."""
+        end = time.perf_counter() + self.TIMEOUT_S
+        finished = self._probe.finished
+        while time.perf_counter() < end:
+            while finished:
+                stamps = finished.popleft()
+                if stamps.read >= sent:
+                    return stamps
+            time.sleep(0.002)
+        return None
