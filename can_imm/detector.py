@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from can_imm.estimation import imm
+from can_imm.estimation import imm, layout
 from can_imm.estimation.entry import entry_point
 from can_imm.estimation.noise import noise_state
 from can_imm.estimation.particles import N_COLUMNS
@@ -93,12 +93,12 @@ class Detector:
         self.reports: np.ndarray[Any, np.dtype[np.void]] = np.zeros(capacity, REPORT_DTYPE)
         self.predicted: np.ndarray[Any, np.dtype[np.void]] = np.zeros(capacity, REPORT_DTYPE)
         self._step_ns = bank.step_ns
-        self._coast_steps = min(int(coast_s * 1e9) // bank.step_ns, imm.MAX_STEPS - 1)
+        self._coast_steps = min(int(coast_s * 1e9) // bank.step_ns, layout.MAX_STEPS - 1)
         self._gate = float(gate)
         self._max_outliers = max_outliers
         self._noise = noise_state(np.random.default_rng(seed))
-        self._objects = np.zeros(capacity, imm.OBJECT_DTYPE)
-        self._work = np.zeros(1, imm.WORK_DTYPE)
+        self._objects = np.zeros(capacity, layout.OBJECT_DTYPE)
+        self._work = np.zeros(1, layout.WORK_DTYPE)
         self._particles: FloatArray = np.zeros((capacity, bank.n_particles, N_COLUMNS))
         self._spare: FloatArray = np.zeros((bank.n_particles, N_COLUMNS))
         self._weights: FloatArray = np.zeros(bank.n_particles)

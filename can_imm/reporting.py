@@ -22,7 +22,7 @@ def conclude_(
     its likelier modes; the lane is the nearer of the two.
 
     Args:
-        bank: record of `imm.BANK_DTYPE`.  width: of the object's lanes [m].
+        bank: record of `layout.BANK_DTYPE`.  width: of the object's lanes [m].
         mu: (M,).  mean: (n,).  cov: (n, n).
     """
     for i in range(report.p.shape[0]):

@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import signal
+from pathlib import Path
 
 from hypothesis import settings
+
+import can_imm
 
 # A shell starts its background jobs with SIGINT ignored, and programs that the tests start would
 # inherit that; a handler they do not.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# numba looks only at the file that a cached kernel is in, not at those that it calls into.
+_package = Path(can_imm.__file__).parent
+_newest = max(path.stat().st_mtime for path in (_package / "estimation").glob("*.py"))
+for _cached in (
+    *_package.glob("__pycache__/*.nb?"),
+    *_package.glob("estimation/__pycache__/*.nb?"),
+):
+    if _cached.stat().st_mtime < _newest:
+        _cached.unlink(missing_ok=True)
 
 # The first example of many tests compiles kernels, so there is no deadline per example; the same
 # examples in every run, so that a red run is red again.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from can_imm.estimation.imm import BANK_DTYPE, MAX_MODES, MAX_STEPS
+from can_imm.estimation.layout import BANK_DTYPE, MAX_MODES, MAX_STEPS
 from can_imm.estimation.models import repeat, stationary
 from can_imm.manoeuvres.constraints import Lanes, fill_bounds, fill_entry, fill_soft, read_lanes
 from can_imm.manoeuvres.motion import constant_speed, read_motion

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from can_imm.estimation.imm import FIXED, LANE, MAX_ROWS
+from can_imm.estimation.layout import FIXED, LANE, MAX_ROWS
 from can_imm.tables import Table, show
 
 Lanes = Mapping[str, tuple[int, int]]

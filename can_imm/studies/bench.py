@@ -24,7 +24,7 @@ from can_imm.bus.reference import Reference
 from can_imm.bus.sinks import LogSink
 from can_imm.bus.sources import LogSource
 from can_imm.detector import Detector
-from can_imm.estimation import imm
+from can_imm.estimation import imm, layout
 from can_imm.estimation.entry import entry_point
 from can_imm.estimation.noise import noise_state
 from can_imm.estimation.particles import N_COLUMNS
@@ -192,7 +192,7 @@ class Estimator:
         assert bank.measurement_variance is not None
         z = _measurements()
         self._scans = [np.repeat(row[None], n, 0) for row in z]
-        objects = np.zeros(n, imm.OBJECT_DTYPE)
+        objects = np.zeros(n, layout.OBJECT_DTYPE)
         tail = (
             np.tile(bank.measurement_variance, (n, 1)),
             np.ones((n, 4), np.bool_),
@@ -205,7 +205,7 @@ class Estimator:
             np.zeros(n, np.int8),
         )
         slot, new = np.arange(n, dtype=np.int32), np.full(n, -1, np.int32)
-        head = (bank.record, objects, np.zeros(1, imm.WORK_DTYPE), n, slot)
+        head = (bank.record, objects, np.zeros(1, layout.WORK_DTYPE), n, slot)
         self._birth = (*head, new, self._scans[0], *tail)
         self._head, self._tail = (*head, np.full(n, STEPS, np.int32)), tail
         self._step = entry_point(imm.process_scan_, *self._birth)

@@ -16,7 +16,7 @@ from filterpy.kalman import IMMEstimator, KalmanFilter
 from filterpy.monte_carlo import systematic_resample
 from scipy.special import log_ndtr
 
-from can_imm.estimation.imm import LANE
+from can_imm.estimation.layout import LANE
 from can_imm.manoeuvres import ModeBank
 from can_imm.types import FloatArray
 

@@ -8,14 +8,14 @@ import numpy as np
 from oracles.gaussian import random_covariance
 from oracles.imm import Imm, Mode
 
-from can_imm.estimation import imm
+from can_imm.estimation import imm, layout
 from can_imm.estimation.noise import noise_state
 from can_imm.estimation.particles import N_COLUMNS
 
 
 def blank(n_modes: int, n_states: int) -> np.ndarray[Any, Any]:
     """A bank (1,) of modes without constraints that stand still; floor of the probabilities 0."""
-    bank = np.zeros(1, imm.BANK_DTYPE)
+    bank = np.zeros(1, layout.BANK_DTYPE)
     record = bank[0]
     record["n_modes"], record["n_states"] = n_modes, n_states
     record["F"][:, :, range(6), range(6)] = 1.0
@@ -41,7 +41,7 @@ def add_soft(
     record["soft_value"][j, c] = value
     record["soft_r"][j, c] = r
     if lanes is not None:
-        record["soft_kind"][j, c] = imm.LANE
+        record["soft_kind"][j, c] = layout.LANE
         record["soft_lanes"][j, c] = lanes
 
 
@@ -63,7 +63,7 @@ def add_bound(
     record["bound_upper"][j, c] = upper
     record["bound_mass"][j, c] = mass
     if lanes is not None:
-        record["bound_kind"][j, c] = imm.LANE
+        record["bound_kind"][j, c] = layout.LANE
         record["bound_lanes"][j, c] = lanes
 
 
@@ -74,8 +74,8 @@ class Runner:
         self, bank: np.ndarray[Any, Any], capacity: int, n_particles: int = 0, seed: int = 0
     ) -> None:
         self.bank = bank
-        self.objects = np.zeros(capacity, imm.OBJECT_DTYPE)
-        self.work = np.zeros(1, imm.WORK_DTYPE)
+        self.objects = np.zeros(capacity, layout.OBJECT_DTYPE)
+        self.work = np.zeros(1, layout.WORK_DTYPE)
         self.particles = np.zeros((capacity, n_particles, N_COLUMNS))
         self.spare = np.zeros((n_particles, N_COLUMNS))
         self.weights = np.zeros(n_particles)

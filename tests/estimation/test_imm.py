@@ -20,7 +20,7 @@ from small_banks import (
     random_pair,
 )
 
-from can_imm.estimation import imm
+from can_imm.estimation import imm, layout
 from can_imm.estimation.models import transition_table
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -244,12 +244,12 @@ def test_extreme_likelihoods_keep_their_order() -> None:
 
 
 def test_floor() -> None:
-    ok, mu = normalise([0.0, -1e5, imm.LOG_FLOOR, 0.0], [0.5, 0.3, 0.2, 0.0], 1e-6)
+    ok, mu = normalise([0.0, -1e5, layout.LOG_FLOOR, 0.0], [0.5, 0.3, 0.2, 0.0], 1e-6)
     assert ok
     np.testing.assert_allclose(mu, np.array([1.0, 1e-6, 1e-6, 1e-6]) / (1.0 + 3e-6), rtol=1e-12)
 
 
-@pytest.mark.parametrize("bad", [imm.LOG_FLOOR, -np.inf, np.inf])
+@pytest.mark.parametrize("bad", [layout.LOG_FLOOR, -np.inf, np.inf])
 def test_no_likelihood_at_all_is_a_failure(bad: float) -> None:
     ok, mu = normalise([bad] * 3, [0.3, 0.3, 0.4], 1e-6)
     assert not ok
@@ -303,7 +303,11 @@ def test_modes_at_the_floor_count_neither_as_sources_nor_in_the_estimate() -> No
 def test_combined_covariance_is_one(seed: int, spread: float) -> None:
     rng = np.random.default_rng(seed)
     n_modes, n = int(rng.integers(1, 8)), int(rng.integers(4, 7))
-    bank, obj, work = blank(n_modes, n), np.zeros(1, imm.OBJECT_DTYPE), np.zeros(1, imm.WORK_DTYPE)
+    bank, obj, work = (
+        blank(n_modes, n),
+        np.zeros(1, layout.OBJECT_DTYPE),
+        np.zeros(1, layout.WORK_DTYPE),
+    )
     xs = [rng.normal(0.0, spread, n) for _ in range(n_modes)]
     Ps = [random_covariance(rng, n) for _ in range(n_modes)]
     oracle = Imm([], xs, Ps, rng.dirichlet(np.ones(n_modes)))
@@ -479,7 +483,7 @@ def test_one_failed_mode_gets_the_floor_and_spoils_nothing() -> None:
 def test_surprise_is_the_distance_from_what_is_possible() -> None:
     bank = blank(1, 4)
     bank[0]["jump_std"] = [1.0, 4.0, 0.5, 2.0]
-    obj = np.zeros(1, imm.OBJECT_DTYPE)
+    obj = np.zeros(1, layout.OBJECT_DTYPE)
     obj[0]["mean"][:4] = [10.0, -2.0, 1.0, 0.5]
     obj[0]["cov"][range(4), range(4)] = [0.1, 0.2, 0.3, 0.4]
     z, valid = np.array([9.0, -1.0, 1.5, 0.0]), np.ones(4, np.bool_)

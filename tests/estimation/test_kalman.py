@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.gaussian import random_covariance
 
-from can_imm.estimation.imm import correct_
 from can_imm.estimation.kalman import log_normal, predict_, update_row_, update_state_
+from can_imm.estimation.modes import correct_
 
 SEEDS = st.integers(0, 2**32 - 1)
 TOLERANCE = {"rtol": 1e-9, "atol": 1e-9}

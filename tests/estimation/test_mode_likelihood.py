@@ -14,7 +14,7 @@ from oracles import gaussian
 from scipy.stats import norm
 from small_banks import add_bound, add_soft, blank
 
-from can_imm.estimation import imm
+from can_imm.estimation import imm, layout
 
 INF = math.inf
 VALID_2 = np.array([True, True, False, False])
@@ -23,7 +23,7 @@ VALID_2 = np.array([True, True, False, False])
 def log_likelihood(bank, x, P, z, r, valid=VALID_2, age=0.0, lane_width=3.0):
     """Of mode 0 by the kernel; also the updated mean and covariance."""
     n = int(bank[0]["n_states"])
-    work = np.zeros(1, imm.WORK_DTYPE)
+    work = np.zeros(1, layout.WORK_DTYPE)
     work[0]["x"][0, :n], work[0]["P"][0, :n, :n] = x, P
     work[0]["lane_width"] = lane_width
     log_l = imm.update_mode_(bank[0]["n_states"], bank[0], work[0], 0, z, r, valid, age)
@@ -185,7 +185,7 @@ def test_a_bound_out_of_reach_makes_the_mode_impossible() -> None:
     add_bound(bank, 0, 0, 1e4, 2e4)
     z, r = np.append(Z, [0.0, 0.0]), np.append(R, [1.0, 1.0])
     log_l, x, P = log_likelihood(bank, X, COV, z, r)
-    assert log_l == imm.LOG_FLOOR
+    assert log_l == layout.LOG_FLOOR
     assert np.isfinite(x).all()
     assert np.linalg.eigvalsh(P).min() > -1e-9
 

@@ -14,7 +14,7 @@ from scipy import integrate
 from scipy.stats import multivariate_normal, norm
 from small_banks import Runner, blank
 
-from can_imm.estimation import imm, particles
+from can_imm.estimation import imm, layout, particles
 from can_imm.estimation.noise import noise_state
 from can_imm.estimation.particles import (
     ENTRY,
@@ -210,7 +210,7 @@ def in_mode_0(runner: Runner) -> Any:
     obj["mu"][:2] = [1.0, 0.0]
     obj["x"][0, :4], obj["P"][0, :4, :4] = X0, P0
     obj["mean"][:4], obj["cov"][:4, :4] = X0, P0
-    obj["log_l"][:2] = [0.0, imm.LOG_FLOOR]
+    obj["log_l"][:2] = [0.0, layout.LOG_FLOOR]
     return obj
 
 
@@ -289,7 +289,7 @@ def test_what_a_slot_held_before_does_not_matter(left_over: float) -> None:
         assert runner.scan([0], [-1], X0, R)[0] == imm.OK
         runner.scan([0], [10], Z, R)
         logs.append(runner.objects[0]["log_l"][1])
-        assert logs[-1] > imm.LOG_FLOOR
+        assert logs[-1] > layout.LOG_FLOOR
     assert logs[0] == logs[1]
 
 

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from can_imm.estimation.imm import LANE, MAX_MODES
+from can_imm.estimation.layout import LANE, MAX_MODES
 from can_imm.manoeuvres import bank_from_dict, load_bank
 from can_imm.manoeuvres.bank import PRESETS
 from can_imm.types import CanImmError

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from can_imm.estimation.imm import FIXED
+from can_imm.estimation.layout import FIXED
 from can_imm.manoeuvres import Manoeuvre, ModeBank, builtin_presets, load_bank
 
 STATES = ["x", "vx", "y", "vy", "ax", "ay"]

@@ -1,0 +1,151 @@
+"""Interaction: state-dependent transitions between the modes, and mixing (equations 14 to 16)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+
+from can_imm.estimation.constraints import normal_mass
+from can_imm.estimation.layout import FIXED, SPEED_STEP
+from can_imm.types import VX, FloatArray, X
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def mix_(
+    n: int, bank: Any, obj: Any, work: Any, j: int, m: int
+) -> None:  # pragma: no cover - compiled
+    """Interaction (15)(16) for target mode j: mixed mean and covariance into work.x[j], work.P[j].
+
+    Where bit s of ``entry_sources[i, j]`` is set, state s of source i is replaced by the mode's
+    entry distribution: what a vehicle that starts this manoeuvre does, not what it did before.
+    Where that is the speed ahead, the change took place at some instant of the last ``m`` steps,
+    all equally likely: x is set back accordingly, with exact first and second moments.  (Sideways
+    the same would only blur a lane change, whose speed builds up within the interval.)
+    ``work.w`` holds the mixing weights.
+    """
+    n_modes = bank.n_modes
+    tau = m * bank.step_s
+    n_sources = 0
+    entered = 0  # states that are replaced for any source
+    for i in range(n_modes):
+        if work.w[i] > 0.0:
+            work.source[n_sources] = i
+            entered |= bank.entry_sources[i, j]
+            n_sources += 1
+    for s in range(n):
+        v = 0.0
+        for k in range(n_sources):
+            i = work.source[k]
+            d = obj.x[i, s]
+            if bank.entry_sources[i, j] >> s & 1:
+                d = bank.entry_mean[j, s]
+            elif s == X and bank.entry_sources[i, j] & SPEED_STEP:
+                d -= 0.5 * tau * (bank.entry_mean[j, VX] - obj.x[i, VX])
+            work.sx[k, s] = d
+            v += work.w[i] * d
+        for k in range(n_sources):
+            work.sx[k, s] -= v
+        work.x[j, s] = v
+    for s in range(n):
+        for t in range(s + 1):
+            replaced = 1 << s | 1 << t
+            v = 0.0
+            for k in range(n_sources):
+                i = work.source[k]
+                p = work.sx[k, s] * work.sx[k, t]
+                if not entered & replaced or not bank.entry_sources[i, j] & replaced:
+                    p += obj.P[i, s, t]
+                elif s == t:
+                    p += bank.entry_var[j, s]
+                v += work.w[i] * p
+            work.P[j, s, t] = v
+            work.P[j, t, s] = v
+    if not entered & SPEED_STEP:
+        return
+    for k in range(n_sources):
+        i = work.source[k]
+        if bank.entry_sources[i, j] & (SPEED_STEP | 1 << X) != SPEED_STEP:
+            continue
+        # x - a (v_new - v_old), the change a seconds before the end of the interval
+        dv = bank.entry_mean[j, VX] - obj.x[i, VX]
+        spread = bank.entry_var[j, VX] + obj.P[i, VX, VX]
+        p = tau * obj.P[i, X, VX] + tau * tau * (spread / 3.0 + dv * dv / 12.0)
+        work.P[j, X, X] += work.w[i] * p
+        for s in range(1, n):
+            p = 0.0
+            if s == VX:
+                p = -0.5 * tau * bank.entry_var[j, VX]
+            elif not bank.entry_sources[i, j] >> s & 1:
+                p = 0.5 * tau * obj.P[i, VX, s]
+            work.P[j, s, X] += work.w[i] * p
+            work.P[j, X, s] = work.P[j, s, X]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def transitions_(
+    n: int, bank: Any, obj: Any, work: Any, m: int
+) -> None:  # pragma: no cover - compiled
+    """State-dependent transition probabilities of this cycle into work.Pi.
+
+    A bound with ``mass`` is a region outside of which the mode does not exist.  The probability of
+    going from i to j is that of the chain times the mass which source i, moved on by ``m`` steps
+    with its own model, has inside j's regions; each row is normalised again, so that a source
+    loses nothing to a mode it cannot reach.  States that the entry replaces do not count.
+    ``work.mu`` holds the probabilities of the modes that are present.
+    """
+    n_modes = bank.n_modes
+    for i in range(n_modes):
+        for j in range(n_modes):
+            work.Pi[i, j] = bank.Pi[m, i, j]
+        if work.mu[i] == 0.0:
+            continue
+        done = 0  # bits of the states that have been moved on
+        total = 0.0
+        for j in range(n_modes):
+            log_mass = 0.0
+            for c in range(bank.n_bounds[j]):
+                s = bank.bound_state[j, c]
+                if not bank.bound_mass[j, c] or (bank.entry_sources[i, j] >> s & 1):
+                    continue
+                if not done >> s & 1:
+                    done |= 1 << s
+                    v = 0.0
+                    q = bank.Q[m, i, s, s]
+                    for k in range(n):
+                        f = bank.F[m, i, s, k]
+                        if f != 0.0:
+                            v += f * obj.x[i, k]
+                            for t in range(n):
+                                q += f * bank.F[m, i, s, t] * obj.P[i, k, t]
+                    work.tx[s] = v
+                    work.var[s] = q
+                base = reference(
+                    bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, work.tx[s]
+                )
+                sd = math.sqrt(max(work.var[s], bank.var_floor))
+                log_mass += normal_mass(
+                    (base + bank.bound_lower[j, c] - work.tx[s]) / sd,
+                    (base + bank.bound_upper[j, c] - work.tx[s]) / sd,
+                )
+            if log_mass != 0.0:
+                work.Pi[i, j] *= math.exp(log_mass)
+            total += work.Pi[i, j]
+        for j in range(n_modes):
+            work.Pi[i, j] = work.Pi[i, j] / total if total > 1e-30 else bank.Pi[m, i, j]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def reference(
+    kind: int, lanes: FloatArray, width: float, y: float
+) -> float:  # pragma: no cover - compiled
+    """What a row's numbers count from: 0, or the centre of the lane nearest to ``y``.
+
+    Args:
+        lanes: (2,) lowest and highest number of the lanes that count; lane k lies at k times width.
+    """
+    if kind == FIXED:
+        return 0.0
+    lane: float = min(max(math.floor(y / width + 0.5), lanes[0]), lanes[1])
+    return lane * width

@@ -1,0 +1,252 @@
+"""What a mode does with its constraint and with a measurement, and how likely that makes it.
+
+The mode likelihood is the density of the measurement given the constraint and the past,
+
+    L_j = int N(z; H x, R) phi_j(x) N(x; x_j, P_j) dx / int phi_j(x) N(x; x_j, P_j) dx,
+
+so that modes whose constraints have different dimensions stay comparable.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from can_imm.estimation.constraints import (
+    LOG_MASS_FLOOR,
+    interval_mass,
+    project_,
+    truncate_,
+)
+from can_imm.estimation.interaction import reference
+from can_imm.estimation.kalman import log_normal, update_row_, update_state_
+from can_imm.estimation.layout import LOG_FLOOR
+from can_imm.estimation.noise import NoiseState, load, store_, uniform
+from can_imm.estimation.particles import (
+    N_COLUMNS,
+    cholesky4_,
+    enter_,
+    moments_,
+    propagate_,
+    resample_,
+    weigh_,
+)
+from can_imm.types import FloatArray
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def constrain_soft_(
+    n: int, bank: Any, j: int, x: FloatArray, P: FloatArray, work: Any
+) -> float:  # pragma: no cover - compiled
+    """Apply the soft equality rows of mode j as pseudo-measurements (22)(23); 0, or NaN on failure.
+
+    Their own density is not part of the mode likelihood: it would reward a prior that already
+    satisfies the constraint, and has another dimension for each mode.
+    """
+    bad = 0.0
+    for c in range(bank.n_soft[j]):
+        s = bank.soft_state[j, c]
+        value = bank.soft_value[j, c] + reference(
+            bank.soft_kind[j, c], bank.soft_lanes[j, c], work.lane_width, x[s]
+        )
+        bad += 0.0 * update_state_(n, x, P, s, value, bank.soft_r[j, c], work.row)[1]
+    return bad
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def correct_(
+    n: int,
+    x: FloatArray,
+    P: FloatArray,
+    z: FloatArray,
+    r: FloatArray,
+    valid: Any,
+    age: float,
+    h: FloatArray,
+    row: FloatArray,
+) -> float:  # pragma: no cover - compiled
+    """Measurement update with the valid components of z, in place.
+
+    Args:
+        z, r: (4,) measured x, vx, y, vy and their variances.  valid: (4,) bool.
+        age: how long before the time of ``x`` the measurement was taken [s]; a position measured
+            then is x - age vx + age^2/2 ax now.
+        h: (n,) scratch.  row: (>= 2, n) scratch.
+
+    Returns:
+        Log density of z; NaN on a numeric failure.
+    """
+    log_l = 0.0
+    for c in range(4):
+        if not valid[c]:
+            continue
+        if age == 0.0:
+            e, v = update_state_(n, x, P, c, z[c], r[c], row)
+            log_l += log_normal(e, v)
+            continue
+        for s in range(n):
+            h[s] = 0.0
+        h[c] = 1.0
+        a = 4 + c // 2  # the axis' acceleration state, if the bank has one
+        if c == 0 or c == 2:
+            h[c + 1] = -age
+            if a < n:
+                h[a] = 0.5 * age * age
+        elif a < n:
+            h[a] = -age
+        e, v = update_row_(n, x, P, h, z[c], r[c], row)
+        log_l += log_normal(e, v)
+    return log_l
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def mass_(
+    n: int, x: FloatArray, P: FloatArray, n_bounds: int, state: Any, floor: float, work: Any
+) -> float:  # pragma: no cover - compiled
+    """Log of the mass of N(x, P) inside all bounds of a mode, one after the other; x, P are kept.
+
+    Args:
+        state: (n_bounds,) the bounded states; their intervals are in work.lower and work.upper.
+    """
+    if n_bounds == 0:
+        return 0.0
+    for s in range(n):
+        work.tx[s] = x[s]
+        for t in range(n):
+            work.tP[s, t] = P[s, t]
+    log_mass = 0.0
+    last = n_bounds - 1
+    for c in range(last):
+        log_mass += truncate_(
+            n, work.tx, work.tP, state[c], work.lower[c], work.upper[c], floor, work.row
+        )
+    return log_mass + interval_mass(
+        work.tx, work.tP, state[last], work.lower[last], work.upper[last]
+    )
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def update_mode_(
+    n: int,
+    bank: Any,
+    work: Any,
+    j: int,
+    z: FloatArray,
+    r: FloatArray,
+    valid: Any,
+    age: float,
+) -> float:  # pragma: no cover - compiled
+    """Constraint and measurement update of Gaussian mode j in work.x[j], work.P[j]; its log L."""
+    x = work.x[j]
+    P = work.P[j]
+    log_l = constrain_soft_(n, bank, j, x, P, work)
+    n_bounds = bank.n_bounds[j]
+    prior = 0.0
+    for c in range(n_bounds):
+        s = bank.bound_state[j, c]
+        # The lane is that of the prior, for the posterior too.
+        base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, x[s])
+        work.lower[c] = base + bank.bound_lower[j, c]
+        work.upper[c] = base + bank.bound_upper[j, c]
+    prior = mass_(n, x, P, n_bounds, bank.bound_state[j], bank.var_floor, work)
+    log_l += correct_(n, x, P, z, r, valid, age, work.h, work.row)
+    if prior < LOG_MASS_FLOOR + 1.0:
+        return LOG_FLOOR  # the constraint contradicts the past beyond what numbers can tell
+    posterior = 0.0
+    if bank.is_projected[j]:
+        # The mass needs the Gaussian before it is projected.
+        posterior = mass_(n, x, P, n_bounds, bank.bound_state[j], bank.var_floor, work)
+    for c in range(n_bounds):
+        s = bank.bound_state[j, c]
+        lower = work.lower[c]
+        upper = work.upper[c]
+        if not bank.is_projected[j]:
+            posterior += truncate_(n, x, P, s, lower, upper, bank.var_floor, work.row)
+        elif x[s] < lower:
+            project_(n, x, P, s, lower, bank.var_floor, work.row)
+        elif x[s] > upper:
+            project_(n, x, P, s, upper, bank.var_floor, work.row)
+    return log_l + posterior - prior
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def keep_combined_(
+    n: int, obj: Any, x: FloatArray, P: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """An impossible mode takes over the combined estimate, so that it can start from there."""
+    for s in range(n):
+        x[s] = obj.mean[s]
+        for t in range(n):
+            P[s, t] = obj.cov[s, t]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def update_particles_(
+    bank: Any,
+    obj: Any,
+    work: Any,
+    j: int,
+    m: int,
+    z: FloatArray,
+    r: FloatArray,
+    valid: Any,
+    age: float,
+    particles: FloatArray,
+    spare: FloatArray,
+    weights: FloatArray,
+    noise: NoiseState,
+) -> float:  # pragma: no cover - compiled
+    """Whole cycle of the particle mode j: interact by drawing from the sources, move, weigh,
+    resample; moments into work.x[j], work.P[j]; log of mean_i[phi_i g_i].
+
+    The mass of the window is part of the likelihood: it is a hard region (a state-dependent
+    transition), not a soft overlap.
+    """
+    n_modes, n = bank.n_modes, bank.n_states
+    total = particles.shape[0]
+    x = work.x[j]
+    P = work.P[j]
+    # systematic allocation of the particles to the sources
+    done = 0
+    cumulative = 0.0
+    words = load(noise)
+    u, words = uniform(words)
+    store_(noise, words)
+    for i in range(n_modes):
+        cumulative += work.w[i]
+        upto = min(int(cumulative * total + u), total) if i < n_modes - 1 else total
+        count = upto - done
+        if count <= 0:
+            continue
+        if i == j:
+            # own particles are equally weighted after resampling: take evenly spaced ones
+            for k in range(count):
+                a = (k * total) // count
+                for c in range(N_COLUMNS):
+                    spare[done + k, c] = particles[a, c]
+        else:
+            cholesky4_(obj.P[i], work.L)
+            enter_(spare, done, count, obj.x[i], work.L, bank.particle, noise)
+        done = upto
+    propagate_(spare, m * bank.step_s, bank.particle, noise)
+    log_l = weigh_(spare, weights, z, r, valid, age, bank.particle)
+    for s in range(n):
+        for t in range(n):
+            P[s, t] = 0.0
+    if log_l == -np.inf:
+        # No particle is feasible; the mode keeps the last moments and the floor probability.
+        keep_combined_(n, obj, x, P)
+        return LOG_FLOOR
+    moments_(spare, weights, x, P)
+    for s in range(4):
+        P[s, s] += bank.var_floor
+    for s in range(4, n):
+        x[s] = 0.0
+        P[s, s] = bank.birth_std[s] ** 2
+    words = load(noise)
+    u, words = uniform(words)
+    store_(noise, words)
+    resample_(spare, weights, particles, total, u)
+    return log_l
