@@ -157,6 +157,11 @@ class ManoeuvreEncoder:
             frames.append(self._estimate.encode(t_ns, object_id, *x))
         return frames
 
+    def estimates(self, reports: npt.NDArray[np.void], t_ns: int) -> list[Frame]:
+        """ObjectEstimate alone for each of the reports (REPORT_DTYPE)."""
+        rows = zip(reports["object_id"].tolist(), reports["x"].tolist(), strict=True)
+        return [self._estimate.encode(t_ns, i, *x) for i, x in rows if i in _OUTPUT_OBJECTS]
+
     def status(self, t_ns: int, values: StatusValues) -> Frame:
         """DetectorStatus."""
         return self._status.encode(t_ns, *values)

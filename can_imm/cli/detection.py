@@ -40,6 +40,12 @@ def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
         help="follow at most N objects at a time (default: 64)",
     )
     parser.add_argument(
+        "--estimates",
+        choices=["scan", "step"],
+        default="scan",
+        help="send ObjectEstimate with each scan (default), or predicted at every 10 ms step",
+    )
+    parser.add_argument(
         "--csv", metavar="OUT", help="write one row per object and scan; - is standard output"
     )
 
@@ -93,7 +99,15 @@ def build(args: argparse.Namespace) -> Detection:
         # last, because it may compile: what is wrong with the options has been said by now
         detector = Detector(bank, capacity=args.objects)
         encoder = ManoeuvreEncoder()
-        node = DetectorNode(decoder, detector, encoder, health, listeners, args.objects)
+        node = DetectorNode(
+            decoder,
+            detector,
+            encoder,
+            health,
+            listeners,
+            args.objects,
+            every_step=args.estimates == "step",
+        )
     return Detection(node, encoder, health, changes, csv)
 
 

@@ -64,6 +64,7 @@ class DetectorNode:
         health: the loop's counters, published in DetectorStatus.
         listeners: called with the reports after each scan.
         capacity: objects that a scan of the decoder can hold.
+        every_step: send the predicted ObjectEstimate at the steps between the scans, too.
 
     Attributes:
         dropped_scans: scans that the detector never saw, because too many came at once.
@@ -77,7 +78,10 @@ class DetectorNode:
         health: Health,
         listeners: Sequence[Listener] = (),
         capacity: int = 64,
+        *,
+        every_step: bool = False,
     ) -> None:
+        self._every_step = every_step
         self.decoder = decoder
         self.detector = detector
         self._encoder = encoder
@@ -109,6 +113,9 @@ class DetectorNode:
             answers += self._encoder.encode(reports, t_ns)
             for listener in self._listeners:
                 listener(t_ns, reports)
+        if self._every_step and n == 0:
+            predicted = self.detector.predicted[: self.detector.predict(t_ns)]
+            answers += self._encoder.estimates(predicted, t_ns)
         if self._status_ns is None or t_ns >= self._status_ns + self._encoder.status_period_ns:
             self._status_ns = t_ns
             answers.append(self._encoder.status(t_ns, self._status(t_ns)))

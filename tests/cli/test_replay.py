@@ -8,9 +8,11 @@ import re
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from can_imm.bus.encoder import OUTPUT_IDS
+from can_imm.bus.listener import EstimateMessage, ManoeuvreDecoder
 from can_imm.bus.sinks import LogSink
 from can_imm.bus.sources import LogSource
 
@@ -197,3 +199,23 @@ def test_the_lane_change_on_a_real_road(can_imm, tmp_path):
     rows = [row for row in rows_of(path.read_text()) if row["object_id"] == "2"]
     said = [row for row in rows if 5.5 < float(row["time_s"]) - began < 11.0]
     assert {row["direction"] for row in said if row["manoeuvre"] == "LANE_CHANGE"} == {"right"}
+
+
+def test_estimates_at_every_step(can_imm, log, tmp_path):
+    """Predicted ones between the scans: a hundred a second, on a line at the object's speed."""
+    few, many = tmp_path / "few.log", tmp_path / "many.log"
+    assert can_imm("replay", log, "--out", few)[0] == 0
+    assert can_imm("replay", log, "--out", many, "--estimates", "step")[0] == 0
+    decoder = ManoeuvreDecoder()
+    seen = [(frame.t_ns, decoder.feed(frame)) for frame in LogSource(many)]
+    places = {t: message for t, message in seen if isinstance(message, EstimateMessage)}
+    first = min(places)
+    assert sorted(places) == list(range(first, max(places) + 1, 10_000_000))
+    changing = [places[t] for t in range(3_010_000_000, 3_100_000_000, 10_000_000)]
+    steps = np.diff([place.y for place in changing])
+    assert steps == pytest.approx(0.01 * changing[0].vy, abs=0.021)  # the resolution is .02 m
+    assert sum(steps) > 0.06
+    # what is said at the scans is the same, but for the counters and checksums of ObjectEstimate
+    assert [f for f in LogSource(few) if f.id == 0x310] == [
+        f for f in LogSource(many) if f.id == 0x310
+    ]
