@@ -345,55 +345,15 @@ def process_scan_(
             continue
         if steps[k] < 0:
             status[k] = birth_(bank[0], objects[s], work[0], z[k], r[k], valid[k], age)
-        elif bank[0].n_states == 4:
-            # The number of states as a constant lets the compiler unroll everything.
-            status[k] = cycle_(
-                4,
-                bank[0],
-                objects[s],
-                work[0],
-                steps[k],
-                z[k],
-                r[k],
-                valid[k],
-                age,
-                gate,
-                particles[s],
-                spare,
-                weights,
-                noise,
-            )
+            continue
+        one = (
+            bank[0], objects[s], work[0], steps[k], z[k], r[k], valid[k], age, gate,
+            particles[s], spare, weights, noise,
+        )  # fmt: skip
+        # The number of states as a constant lets the compiler unroll everything.
+        if bank[0].n_states == 4:
+            status[k] = cycle_(4, *one)
         elif bank[0].n_states == 5:
-            status[k] = cycle_(
-                5,
-                bank[0],
-                objects[s],
-                work[0],
-                steps[k],
-                z[k],
-                r[k],
-                valid[k],
-                age,
-                gate,
-                particles[s],
-                spare,
-                weights,
-                noise,
-            )
+            status[k] = cycle_(5, *one)
         else:
-            status[k] = cycle_(
-                bank[0].n_states,
-                bank[0],
-                objects[s],
-                work[0],
-                steps[k],
-                z[k],
-                r[k],
-                valid[k],
-                age,
-                gate,
-                particles[s],
-                spare,
-                weights,
-                noise,
-            )
+            status[k] = cycle_(bank[0].n_states, *one)
