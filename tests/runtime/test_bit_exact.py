@@ -116,9 +116,11 @@ def test_real_time_run_with_jitter_and_late_frames(bus_pair, make_node, tmp_path
 
         def __init__(self, node) -> None:
             self.node = node
+            self.steps = 0
 
         def step(self, t_ns, frames):
-            if random.random() < 0.05:
+            self.steps += 1
+            if self.steps % 12 == 0:
                 time.sleep(0.03)
             return self.node.step(t_ns, frames)
 
