@@ -36,8 +36,6 @@ class Manoeuvre(IntEnum):
 
 N_MANOEUVRES = len(Manoeuvre)
 
-SCAN_OK, SCAN_INCOMPLETE = 0, 1
-
 
 class Scan:
     """One sensor scan in preallocated arrays; rows ``0 <= i < n`` are in use.

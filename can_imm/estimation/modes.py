@@ -33,7 +33,7 @@ from can_imm.estimation.particles import (
     resample_,
     weigh_,
 )
-from can_imm.types import FloatArray
+from can_imm.types import AX, FloatArray
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -89,7 +89,7 @@ def correct_(
         for s in range(n):
             h[s] = 0.0
         h[c] = 1.0
-        a = 4 + c // 2  # the axis' acceleration state, if the bank has one
+        a = AX + c // 2  # the axis' acceleration state, if the bank has one
         if c == 0 or c == 2:
             h[c + 1] = -age
             if a < n:

@@ -35,6 +35,42 @@ Listener = Callable[[int, Reports], None]
 detector's own buffer and holds good until the next step."""
 
 
+class Waiting(Generic[S]):
+    """Scans that wait for their step, in copies: a decoder reuses its scan, and a node takes one
+    per step.
+
+    Args:
+        copies: buffers for the scans; more than these cannot wait.
+
+    Attributes:
+        dropped: scans for which no copy was free.
+    """
+
+    def __init__(self, copies: list[S]) -> None:
+        self._free: list[S] = copies
+        self._queue: deque[S] = deque()
+        self.dropped = 0
+
+    def put(self, scan: S | None) -> None:
+        """Copy a scan, if there is one, to the end of the queue."""
+        if scan is None:
+            return
+        if not self._free:
+            self.dropped += 1
+            return
+        copy = self._free.pop()
+        copy.copy_from(scan)
+        self._queue.append(copy)
+
+    def take(self) -> S | None:
+        """Give out the first scan, if any waits; `done` takes it back."""
+        return self._queue.popleft() if self._queue else None
+
+    def done(self, scan: S) -> None:
+        """Take a scan back: another may be copied over it."""
+        self._free.append(scan)
+
+
 class ScanEncoder(Protocol[S_contra]):
     """Writes scans of one kind as frames."""
 
@@ -65,9 +101,6 @@ class DetectorNode:
         listeners: called with the reports after each scan.
         capacity: objects that a scan of the decoder can hold.
         every_step: send the predicted ObjectEstimate at the steps between the scans, too.
-
-    Attributes:
-        dropped_scans: scans that the detector never saw, because too many came at once.
     """
 
     def __init__(
@@ -87,27 +120,29 @@ class DetectorNode:
         self._encoder = encoder
         self._health = health
         self._listeners = listeners
-        # The decoder reuses its scan and the detector takes one per step: the rest waits in copies.
-        self._free = [Scan(capacity) for _ in range(MAX_WAITING)]
-        self._waiting: deque[Scan] = deque()
-        self.dropped_scans = 0
+        self._waiting = Waiting([Scan(capacity) for _ in range(MAX_WAITING)])
         # answers go where the sensor's frames came from
         self._channel: str | None = None
         self._seen_ns: int | None = None
         self._status_ns: int | None = None
+
+    @property
+    def dropped_scans(self) -> int:
+        """Scans that the detector never saw, because too many came at once."""
+        return self._waiting.dropped
 
     def step(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
         for frame in frames:
             scan = self.decoder.feed(frame)
             if scan is not None:
                 self._channel = frame.channel
-                self._queue(scan)
-        self._queue(self.decoder.flush(t_ns))
-        scan = self._waiting.popleft() if self._waiting else None
+                self._waiting.put(scan)
+        self._waiting.put(self.decoder.flush(t_ns))
+        scan = self._waiting.take()
         n = self.detector.step(t_ns, scan)
         answers: list[Frame] = []
         if scan is not None:
-            self._free.append(scan)
+            self._waiting.done(scan)
             self._seen_ns = t_ns
             reports = self.detector.reports[:n]
             answers += self._encoder.encode(reports, t_ns)
@@ -128,16 +163,6 @@ class DetectorNode:
         """Return the last frame of a detector that ends: DetectorStatus, state Stopping."""
         values = self._status(t_ns)._replace(state=DetectorState.STOPPING)
         return [self._encoder.status(t_ns, values)._replace(channel=self._channel)]
-
-    def _queue(self, scan: Scan | None) -> None:
-        if scan is None:
-            return
-        if not self._free:
-            self.dropped_scans += 1
-            return
-        copy = self._free.pop()
-        copy.copy_from(scan)
-        self._waiting.append(copy)
 
     def _status(self, t_ns: int) -> StatusValues:
         if self._seen_ns is None:
