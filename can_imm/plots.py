@@ -37,7 +37,7 @@ COLOURS = {
 }
 """One colour per manoeuvre in every figure (Okabe and Ito, told apart by the colour-blind)."""
 
-MANOEUVRES = tuple(m for m in Manoeuvre if m is not Manoeuvre.UNKNOWN)
+MANOEUVRES = tuple(Manoeuvre(value) for value in range(1, 8))
 STATES = (("x", "m"), ("vx", "m/s"), ("y", "m"), ("vy", "m/s"))
 _TRUE, _FILTERED, _MEASURED, _BAR = "#000000", "#0072b2", "#9a9a9a", "#6f8fb0"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numba
+import numpy as np
 
 from can_imm.estimation.imm import extrapolate_
 from can_imm.types import FloatArray, Manoeuvre
@@ -43,6 +44,9 @@ def conclude_(
     report.second = second
     report.probability = report.p[best]
     report.second_probability = report.p[second]
+    report.flags = 0
+    report.duplicate_of = -1
+    report.ego_speed = np.nan
     report.direction = 0
     if best == _LANE_CHANGE:
         report.direction = 1 if turn > 0.0 else -1

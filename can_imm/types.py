@@ -32,9 +32,16 @@ class Manoeuvre(IntEnum):
     RECEDING = 5
     APPROACHING = 6
     REAR_END = 7
+    KEEP_LANE = 8
+    STATIONARY = 9
+    ONCOMING = 10
 
 
 N_MANOEUVRES = len(Manoeuvre)
+
+CUT_IN, CUT_OUT, OVERTAKING_ANOTHER = 1, 2, 4
+"""Bits of a report's ``flags``: a lane change into or out of the ego's lane; the object passes
+another one whose lane it left to the left."""
 
 
 class Scan:
@@ -46,7 +53,13 @@ class Scan:
         incomplete: fewer objects arrived than the sensor announced.
         n: number of objects.
         ids: (capacity,) int32, object ids as the sensor names them (a track slot's number counts).
-        z: (capacity, 4) measured x, vx, y, vy [m, m/s, m, m/s].
+        ego_speed: of the observing vehicle [m/s], NaN where the bus does not tell.
+        ego_yaw_rate: of the observing vehicle [rad/s], positive to the left, NaN where unknown.
+        angle: (capacity,) the axes in which a row was measured are turned by so much against the
+            vehicle's, positive to the left [rad].  0 for a sensor with Cartesian coordinates; for a
+            polar one the bearing: its first axis then points from the vehicle's origin to the
+            object, ``z`` is (range, range rate, 0, -) and the noise is independent in these axes.
+        z: (capacity, 4) measured x, vx, y, vy [m, m/s, m, m/s], in axes turned by ``angle``.
         std: (capacity, 4) standard deviations of ``z``, same units.
         valid: (capacity, 4) which components were measured; the others' values mean nothing.
         new: (capacity,) the sensor says that this id names another object than in its last scan.
@@ -54,7 +67,8 @@ class Scan:
     """
 
     __slots__ = (
-        "counter", "existence", "ids", "incomplete", "n", "new", "std", "t_ns", "valid", "z",
+        "angle", "counter", "ego_speed", "ego_yaw_rate", "existence", "ids", "incomplete", "n", "new",
+        "std", "t_ns", "valid", "z",
     )  # fmt: skip
 
     def __init__(self, capacity: int) -> None:
@@ -62,6 +76,8 @@ class Scan:
         self.counter = -1
         self.incomplete = False
         self.n = 0
+        self.ego_speed = self.ego_yaw_rate = float("nan")
+        self.angle: FloatArray = np.zeros(capacity)
         self.ids: IntArray = np.zeros(capacity, np.int32)
         self.z: FloatArray = np.zeros((capacity, 4))
         self.std: FloatArray = np.ones((capacity, 4))
@@ -83,7 +99,8 @@ class Scan:
             other.incomplete,
             n,
         )
-        for name in ("ids", "z", "std", "valid", "new", "existence"):
+        self.ego_speed, self.ego_yaw_rate = other.ego_speed, other.ego_yaw_rate
+        for name in ("ids", "angle", "z", "std", "valid", "new", "existence"):
             getattr(self, name)[:n] = getattr(other, name)[:n]
 
 
@@ -144,12 +161,15 @@ REPORT_DTYPE = np.dtype(
         ("x", np.float64, (4,)),
         ("cov", np.float64, (4, 4)),
         ("p", np.float64, (N_MANOEUVRES,)),
+        ("ego_speed", np.float64),
         ("object_id", np.int32),
+        ("duplicate_of", np.int32),
         ("age", np.int32),
         ("manoeuvre", np.int8),
         ("second", np.int8),
         ("direction", np.int8),
         ("lane", np.int8),
+        ("flags", np.int8),
         ("coasting", np.bool_),
     ],
     align=True,
@@ -159,7 +179,9 @@ REPORT_DTYPE = np.dtype(
 ``t_ns`` time for which it holds: that of the step which took the scan; ``age`` number of scans in
 which the object was seen; ``manoeuvre`` and ``second`` are values of `Manoeuvre`; ``direction`` of
 a lane change: +1 left, -1 right, 0 none;
-``lane`` 0 right, 1 left; ``coasting`` the object was missed in this scan; ``x``, ``cov`` mean and
+``lane`` with two lanes 0 right, 1 left; otherwise 0 the ego's, +1 the next to the left;
+``flags`` bits `CUT_IN`, `CUT_OUT`, `OVERTAKING_ANOTHER`; ``duplicate_of`` object id of an older track
+of the same vehicle, -1 if there is none; ``ego_speed`` [m/s], NaN if unknown; ``coasting`` the object was missed in this scan; ``x``, ``cov`` mean and
 covariance of (x, vx, y, vy); ``p`` probability by `Manoeuvre` value, summing to 1 (all 0 while
 UNKNOWN).
 """

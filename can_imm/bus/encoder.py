@@ -14,7 +14,7 @@ from can_imm.bus.codec import compile_packer, field, load_dbc
 from can_imm.bus.frame import Frame
 from can_imm.bus.profile import dbc_dir
 from can_imm.bus.protection import P01_COUNTERS, p01_data_id, p01_protect
-from can_imm.types import Scan
+from can_imm.types import CUT_IN, CUT_OUT, OVERTAKING_ANOTHER, Scan
 
 DBC = dbc_dir() / "can_imm.dbc"
 
@@ -25,10 +25,16 @@ OUTPUT_IDS = frozenset({0x310, 0x311, STATUS_ID})
 DIRECTIONS = (0, 1, -1)
 """Direction of a lane change (+1 left, -1 right) by the value on the bus."""
 
+EVENTS = tuple(
+    1 if flags & CUT_IN else 2 if flags & CUT_OUT else 3 if flags & OVERTAKING_ANOTHER else 0
+    for flags in range(8)
+)
+"""Value of signal Event by a report's flags: there is room for one of them."""
+
 _SENSOR_OBJECTS = range(64)
-_OUTPUT_OBJECTS = range(127)
+_OUTPUT_OBJECTS = range(255)
 _REPORTED = (
-    "object_id", "direction", "lane", "probability", "second_probability", "x",
+    "object_id", "direction", "lane", "flags", "probability", "second_probability", "x",
     "coasting", "manoeuvre", "second", "age",
 )  # fmt: skip
 
@@ -118,7 +124,7 @@ class RadarEncoder:
 class ManoeuvreEncoder:
     """The detector's frames.
 
-    A report whose object id does not fit the messages (0 to 126) is left out and counted in
+    A report whose object id does not fit the messages (0 to 254) is left out and counted in
     ``left_out``.
 
     Attributes:
@@ -128,7 +134,7 @@ class ManoeuvreEncoder:
     def __init__(self) -> None:
         self._state = MessageEncoder(
             "ManoeuvreState",
-            ("ObjectId", "Direction", "Lane", "Probability", "SecondProbability",
+            ("ObjectId", "Direction", "Lane", "Event", "Probability", "SecondProbability",
              "Coasting", "Manoeuvre", "SecondManoeuvre", "TrackAge"),
         )  # fmt: skip
         self._estimate = MessageEncoder(
@@ -145,14 +151,15 @@ class ManoeuvreEncoder:
         """ManoeuvreState and ObjectEstimate for each of the reports (REPORT_DTYPE)."""
         frames = []
         columns = (reports[name].tolist() for name in _REPORTED)
-        for object_id, direction, lane, p, second_p, x, *rest in zip(*columns, strict=True):
+        for object_id, direction, lane, flags, p, second_p, x, *rest in zip(*columns, strict=True):
             if object_id not in _OUTPUT_OBJECTS:
                 self.left_out += 1
                 continue
-            lane = lane if lane >= 0 else np.nan
-            where = DIRECTIONS.index(direction)
+            where, event = DIRECTIONS.index(direction), EVENTS[flags]
             frames.append(
-                self._state.encode(t_ns, object_id, where, lane, 100 * p, 100 * second_p, *rest)
+                self._state.encode(
+                    t_ns, object_id, where, lane, event, 100 * p, 100 * second_p, *rest
+                )
             )
             frames.append(self._estimate.encode(t_ns, object_id, *x))
         return frames

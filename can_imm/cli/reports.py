@@ -12,7 +12,7 @@ from typing import TextIO
 from can_imm.runtime.nodes import Reports
 from can_imm.types import Manoeuvre
 
-MODES = [manoeuvre for manoeuvre in Manoeuvre if manoeuvre is not Manoeuvre.UNKNOWN]
+MODES = [Manoeuvre(value) for value in range(1, 8)]
 STATES = ["x", "vx", "y", "vy"]
 COLUMNS = [
     "time_s",

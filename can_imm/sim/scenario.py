@@ -31,7 +31,7 @@ __all__ = [
 _KMH = 3.6
 _LANES = {"right": RIGHT, "left": LEFT}
 _DIRECTIONS = {"left": +1, "right": -1}
-_LABELS = {m.name: m for m in Manoeuvre if m not in (Manoeuvre.UNKNOWN, Manoeuvre.REAR_END)}
+_LABELS = {m.name: m for m in map(Manoeuvre, range(1, Manoeuvre.REAR_END))}
 _FOLDER = Path(__file__).parent / "scenarios"
 
 
