@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from can_imm.manoeuvres import ModeBank
 from can_imm.relations import MEMORY_DTYPE, relate_, shift_lanes_
 from can_imm.reporting import extrapolate_all_, fill_reports_
 from can_imm.road import RoadFrame
-from can_imm.types import REPORT_DTYPE, CanImmError, FloatArray, IntArray, Scan
+from can_imm.types import REPORT_DTYPE, BoolArray, CanImmError, FloatArray, IntArray, Scan
 
 LARGEST = 1e6
 """A measured value, or standard deviation, beyond this is invalid; squares cannot overflow."""
@@ -56,6 +56,37 @@ class DetectorCounts:
     reused_ids: int = 0
 
 
+class History(Protocol):
+    """Who writes down what the detector thinks of its tracks; see `smoothing`."""
+
+    def scan(
+        self,
+        now: int,
+        objects: Any,
+        ids: IntArray,
+        measured: BoolArray,
+        reports: np.ndarray[Any, np.dtype[np.void]],
+        road: FloatArray | None,
+        moved: int,
+        ego_speed: float,
+    ) -> None:
+        """A scan was used; all arrays are the detector's own and change with the next one.
+
+        Args:
+            now: number of the step.
+            objects: (capacity,) of `layout.OBJECT_DTYPE`.
+            ids: (capacity,) object id of each slot, -1 for a free one.
+            measured: (capacity,) the slot was updated by this scan.
+            reports: (n,) of the slots in use, in their order, in the road's axes and unrelated.
+            road: (7,) state of `estimation.road`, None without a road.
+            moved: lanes that the ego has moved to the left since the last scan.
+            ego_speed: [m/s], NaN where unknown.
+        """
+
+    def end(self, slot: int) -> None:
+        """The track in this slot ended; another one may begin there."""
+
+
 class Detector:
     """Runs the constrained IMM for every object; one call per step of the loop.
 
@@ -67,6 +98,7 @@ class Detector:
         predicted: (capacity,) of `REPORT_DTYPE`: `predict` writes the first `n_tracked` rows.
         counts: `DetectorCounts`.
         n_tracked: number of objects tracked now.
+        history: is told of every scan and of every track's end; None: nobody is.
 
     Args:
         bank: mode bank; its step is the loop's.
@@ -93,6 +125,7 @@ class Detector:
         self.bank = bank
         self.capacity = capacity
         self.counts = DetectorCounts()
+        self.history: History | None = None
         self.reports: np.ndarray[Any, np.dtype[np.void]] = np.zeros(capacity, REPORT_DTYPE)
         self.predicted: np.ndarray[Any, np.dtype[np.void]] = np.zeros(capacity, REPORT_DTYPE)
         self._step_ns = bank.step_ns
@@ -132,6 +165,11 @@ class Detector:
     def n_tracked(self) -> int:
         """Number of objects tracked now."""
         return len(self._slot_of)
+
+    @property
+    def road(self) -> RoadFrame | None:
+        """The axes of the road, None with a bank that has none."""
+        return self._road
 
     def _grow_rows(self, n: int) -> None:
         """Room for scans of up to n rows; happens once, for the first scan of a decoder."""
@@ -185,6 +223,7 @@ class Detector:
             self._road.localise_(scan, self._z, self._r)
         self._process(*self._arguments(scan, n, (t_ns - scan.t_ns) * 1e-9))
         self._settle(scan, now)
+        moved = 0
         if self._road is not None:
             moved = self._road.watch_(
                 self.bank, self._objects, scan, self._slot, self._status, self._age
@@ -192,7 +231,7 @@ class Detector:
             if moved:
                 shift_lanes_(self._memory, moved)
         self._bury(now)
-        return self._report(t_ns, now)
+        return self._report(t_ns, now, moved)
 
     def _take_measurements(self, scan: Scan) -> None:
         """Values, variances and axes of the scan, in buffers of our own."""
@@ -343,6 +382,8 @@ class Detector:
         self._id[slot] = -1
         self._free.append(slot)
         self.counts.deaths += 1
+        if self.history is not None:
+            self.history.end(slot)
 
     def _bury(self, now: int) -> None:
         """End the tracks that coasted for too long."""
@@ -363,7 +404,7 @@ class Detector:
             self.reports,
         )
 
-    def _report(self, t_ns: int, now: int) -> int:
+    def _report(self, t_ns: int, now: int, moved: int) -> int:
         """Reports of all tracks; coasting ones are extrapolated."""
         n: int = self._fill(*self._report_arguments(t_ns))
         coasting = self.reports["coasting"]
@@ -372,6 +413,11 @@ class Detector:
             for k in np.flatnonzero(coasting[:n]):
                 self.reports[k] = self.predicted[k]
                 self.reports["t_ns"][k] = t_ns
+        if self.history is not None:
+            self.history.scan(
+                now, self._objects, self._id, self._measured, self.reports[:n],
+                None if self._road is None else self._road.x, moved, self._ego_speed,
+            )  # fmt: skip
         if self._road is not None:
             relate_(self._id, self._memory, self.reports, n)
             self._road.globalise_(self.reports, n)

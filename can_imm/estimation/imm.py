@@ -194,12 +194,13 @@ def cycle_(
     if surprise(bank, obj, m, z, r, valid, age, work.angle) > gate:
         return OUTLIER
     work.lane_width = obj.lane_width
+    work.elapsed = m * bank.step_s
     present_(bank, obj, work.mu)
     transitions_(n, bank, obj, work, m)
     for j in range(n_modes):
         c = 0.0
         for i in range(n_modes):
-            work.w[i] = work.Pi[i, j] * work.mu[i]
+            work.w[i] = obj.Pi[i, j] * work.mu[i]
             c += work.w[i]
         work.c[j] = c
         for i in range(n_modes):
@@ -247,6 +248,7 @@ def birth_(
     cos, sin = math.cos(work.angle), math.sin(work.angle)
     obj.lane_scans = 0.0
     work.lane_width = obj.lane_width
+    work.elapsed = 0.1
     for j in range(n_modes):
         x = work.x[j]
         P = work.P[j]

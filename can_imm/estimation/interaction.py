@@ -87,7 +87,7 @@ def mix_(
 def transitions_(
     n: int, bank: Any, obj: Any, work: Any, m: int
 ) -> None:  # pragma: no cover - compiled
-    """State-dependent transition probabilities of this cycle into work.Pi.
+    """State-dependent transition probabilities of this cycle into obj.Pi.
 
     A bound with ``mass`` is a region outside of which the mode does not exist.  The probability of
     going from i to j is that of the chain times the mass which source i, moved on by ``m`` steps
@@ -98,7 +98,7 @@ def transitions_(
     n_modes = bank.n_modes
     for i in range(n_modes):
         for j in range(n_modes):
-            work.Pi[i, j] = bank.Pi[m, i, j]
+            obj.Pi[i, j] = bank.Pi[m, i, j]
         if work.mu[i] == 0.0:
             continue
         done = 0  # bits of the states that have been moved on
@@ -128,10 +128,10 @@ def transitions_(
                     (base + bank.bound_upper[j, c] - work.tx[s]) / sd,
                 )
             if log_mass != 0.0:
-                work.Pi[i, j] *= math.exp(log_mass)
-            total += work.Pi[i, j]
+                obj.Pi[i, j] *= math.exp(log_mass)
+            total += obj.Pi[i, j]
         for j in range(n_modes):
-            work.Pi[i, j] = work.Pi[i, j] / total if total > 1e-30 else bank.Pi[m, i, j]
+            obj.Pi[i, j] = obj.Pi[i, j] / total if total > 1e-30 else bank.Pi[m, i, j]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
