@@ -21,6 +21,14 @@ from can_imm.types import REPORT_DTYPE, BoolArray, CanImmError, FloatArray, IntA
 LARGEST = 1e6
 """A measured value, or standard deviation, beyond this is invalid; squares cannot overflow."""
 
+FASTEST, SHARPEST = 150.0, 5.0
+"""No vehicle drives [m/s] or turns [rad/s] faster: a bus that says so does not know."""
+
+
+def possible(value: float, most: float) -> float:
+    """The value, or NaN (unknown) if it is larger than ``most`` in either direction."""
+    return value if abs(value) <= most else math.nan
+
 
 @dataclass(slots=True)
 class DetectorCounts:
@@ -32,11 +40,12 @@ class DetectorCounts:
         repeated_scans: the last used one once more, by its time or by its counter.
         measurements: object measurements that updated a track or began one.
         outliers: measurements too far from anything the object could do; the track coasts.
-        invalid: measurements that are no numbers, whose standard deviation is none, or without any
-            valid component.
+        invalid: measurements that are no numbers, whose standard deviation or angle is none, or
+            without any valid component.
         numeric_failures: cycles that gave no finite result; the track starts anew.
         overflow: measurements for which no slot was free.
         duplicates: second and later measurements of one id in one scan.
+        ego_invalid: scans whose speed or yaw rate of the ego no vehicle has; taken as unknown.
         births, deaths: tracks begun and ended.
         reused_ids: births because the sensor said that an id names another object, or because a
             track was an outlier for too long.
@@ -51,6 +60,7 @@ class DetectorCounts:
     numeric_failures: int = 0
     overflow: int = 0
     duplicates: int = 0
+    ego_invalid: int = 0
     births: int = 0
     deaths: int = 0
     reused_ids: int = 0
@@ -156,7 +166,8 @@ class Detector:
         # what lies between objects and between scans
         self._memory = np.zeros(capacity, MEMORY_DTYPE)
         self._road = None if bank.road is None else RoadFrame(bank.road)
-        self._ego_speed = np.nan
+        self._ego_speed = math.nan
+        self._ego_yaw_rate = math.nan
         self._last_t_ns = -1
         self._last_counter = -1
         self._warm_up()
@@ -219,7 +230,7 @@ class Detector:
         self._assign(scan, now)
         self._take_measurements(scan)
         if self._road is not None:
-            self._road.move(scan)
+            self._road.move(scan.t_ns, self._ego_speed, self._ego_yaw_rate)
             self._road.localise_(scan, self._z, self._r)
         self._process(*self._arguments(scan, n, (t_ns - scan.t_ns) * 1e-9))
         self._settle(scan, now)
@@ -240,9 +251,35 @@ class Detector:
         self._angle[:n] = scan.angle[:n]
         np.clip(scan.std[:n], 0.0, LARGEST, out=self._r[:n])
         np.square(self._r[:n], out=self._r[:n])
+        if self.bank.n_particles:
+            self._straighten(scan)
         if self.bank.measurement_variance is not None:
             self._r[:n] = self.bank.measurement_variance
-        self._ego_speed = scan.ego_speed
+        self._ego_speed = possible(scan.ego_speed, FASTEST)
+        self._ego_yaw_rate = possible(scan.ego_yaw_rate, SHARPEST)
+        told = math.isnan(scan.ego_speed), math.isnan(scan.ego_yaw_rate)
+        if told != (math.isnan(self._ego_speed), math.isnan(self._ego_yaw_rate)):
+            self.counts.ego_invalid += 1
+
+    def _straighten(self, scan: Scan) -> None:
+        """Measurements in turned axes as ones in the vehicle's, since particles know no others.
+
+        Variances go along, the covariance between the axes is dropped.  A pair of which only the
+        first value was measured stays as it is: a speed along the line of sight is taken as vx.
+        """
+        n = scan.n
+        turned = (self._angle[:n] != 0.0) & (self._slot[:n] >= 0)
+        if not turned.any():
+            return
+        for c in (0, 1):
+            k = np.flatnonzero(turned & scan.valid[:n, c] & scan.valid[:n, c + 2])
+            cos, sin = np.cos(self._angle[k]), np.sin(self._angle[k])
+            u, w = self._z[k, c], self._z[k, c + 2]
+            self._z[k, c], self._z[k, c + 2] = u * cos - w * sin, u * sin + w * cos
+            u, w = self._r[k, c], self._r[k, c + 2]
+            self._r[k, c] = u * cos**2 + w * sin**2
+            self._r[k, c + 2] = u * sin**2 + w * cos**2
+        self._angle[:n] = 0.0
 
     def predict(self, t_ns: int) -> int:
         """Extrapolate every tracked object to the step at ``t_ns`` into `predicted`.
@@ -297,7 +334,8 @@ class Detector:
         valid = scan.valid[: scan.n]
         usable = (np.abs(scan.z[: scan.n]) < LARGEST) & (std > 0.0) & (std < LARGEST) & valid
         # usable where it counts, and in one component at least
-        sound = ((usable == valid).all(1) & usable.any(1)).tolist()
+        straight = np.abs(scan.angle[: scan.n]) <= LARGEST
+        sound = ((usable == valid).all(1) & usable.any(1) & straight).tolist()
         new = scan.new[: scan.n].tolist()
         self._slot[: scan.n] = -1
         for k, name in enumerate(scan.ids[: scan.n].tolist()):
@@ -342,7 +380,7 @@ class Detector:
             self._r,
             scan.valid,
             self._angle,
-            layout.UNKNOWN_GROUND if math.isnan(scan.ego_speed) else -scan.ego_speed,
+            layout.UNKNOWN_GROUND if math.isnan(self._ego_speed) else -self._ego_speed,
             0.0 if self._road is None else self._road.width,
             age,
             self._gate,

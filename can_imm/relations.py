@@ -63,7 +63,10 @@ def relate_(ids: Any, memory: Any, reports: Any, n: int) -> None:  # pragma: no 
         report = reports[k]
         if m.left == NO_LANE or report.t_ns - m.left_ns > OVERTAKING_NS:
             continue
-        if report.lane != m.left + 1 and report.manoeuvre != _LANE_CHANGE:
+        if report.manoeuvre == _LANE_CHANGE:
+            if report.direction < 0:
+                continue
+        elif report.lane != m.left + 1:
             continue
         for other in range(n):
             o = reports[other]

@@ -21,8 +21,8 @@ LONGEST_S = 1.0
 class RoadFrame:
     """Keeps `estimation.road`'s filter, and what belongs to the scan in hand.
 
-    In the road's axes y counts from the middle of the ego's lane at the same distance, so that lane k
-    lies at k times the width whatever the ego and the road do.
+    In the road's axes y counts from the middle of the ego's lane at the same distance, so that
+    lane k lies at k times the width whatever the ego and the road do.
 
     Args:
         par: `estimation.road.PARAMETERS`.
@@ -56,22 +56,25 @@ class RoadFrame:
         road.turn_with_road_(x, P, self._par, 20.0, 0.0, 1.0)
         road.place(x, self._h, 0.0, 0.0, 20.0)
 
-    def move(self, scan: Scan) -> None:
-        """Move the ego on to the time of this scan."""
-        dt = (scan.t_ns - self._t_ns) * 1e-9
+    def move(self, t_ns: int, speed: float, yaw_rate: float) -> None:
+        """Move the ego on to the time of the next scan.
+
+        Args:
+            t_ns: of the scan [ns], later than that of the last one.
+            speed, yaw_rate: of the ego [m/s, rad/s], NaN where unknown, else finite.
+        """
+        dt = (t_ns - self._t_ns) * 1e-9
         if self._t_ns < 0 or dt > LONGEST_S:
             width, var = self.x[road.WIDTH], self.P[road.WIDTH, road.WIDTH]
             self.x, self.P = road.new_road(self._par)
             self.x[road.WIDTH], self.P[road.WIDTH, road.WIDTH] = width, var
             self._guide_slot[:] = road.FREE
-            road.turn_with_road_(
-                self.x, self.P, self._par, scan.ego_speed, scan.ego_yaw_rate, 1.0
-            )
+            road.turn_with_road_(self.x, self.P, self._par, speed, yaw_rate, 1.0)
         else:
             self._dt = dt
-            road.predict_road_(self.x, self.P, self._par, dt, scan.ego_speed, scan.ego_yaw_rate)
-        self._t_ns = scan.t_ns
-        self._speed = scan.ego_speed
+            road.predict_road_(self.x, self.P, self._par, dt, speed, yaw_rate)
+        self._t_ns = t_ns
+        self._speed = speed
 
     def localise_(self, scan: Scan, z: FloatArray, r: FloatArray) -> None:
         """Measurements z, r (N, 4) of the scan into the road's axes, in place."""
@@ -81,11 +84,13 @@ class RoadFrame:
         self, bank: ModeBank, objects: Any, scan: Scan, slot: Any, status: Any, age: Any
     ) -> int:
         """Update the road by the traffic; see `estimation.road.watch_traffic_`."""
+        with np.errstate(over="ignore"):  # a row that is not used may say anything
+            r = np.square(scan.std)
         return int(
             road.watch_traffic_(
                 self.x, self.P, self._par, self._guide_slot, self._guide_unseen,
                 bank.record, objects, scan.n, slot, status, age,
-                scan.z, np.square(scan.std), scan.valid, scan.angle, self._dt,
+                scan.z, r, scan.valid, scan.angle, self._dt,
             )
         )  # fmt: skip
 

@@ -48,15 +48,24 @@ def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--objects",
         type=positive_int,
-        default=64,
+        default=128,
         metavar="N",
-        help="follow at most N objects at a time (default: 64)",
+        help="follow at most N objects at a time (default: 128)",
     )
     parser.add_argument(
         "--estimates",
         choices=["scan", "step"],
         default="scan",
         help="send ObjectEstimate with each scan (default), or predicted at every 10 ms step",
+    )
+    parser.add_argument(
+        "--lane-width", type=float, metavar="M", help="width of the lanes; otherwise it is learned"
+    )
+    parser.add_argument(
+        "--lane-offset",
+        type=float,
+        metavar="M",
+        help="where in its lane the ego usually is, to the left; preset motorway",
     )
     parser.add_argument(
         "--csv", metavar="OUT", help="write one row per object and scan; - is standard output"
@@ -124,7 +133,9 @@ class Equipment:
 
             self._args = args
             self.profile = load_profile(args.profile, sensor=args.sensor)
-            self.bank = load_bank(args.preset)
+            self.bank = load_bank(
+                args.preset, lane_width=args.lane_width, lane_offset=args.lane_offset
+            )
             self._files = ExitStack()
             self.csv = self.event_file = None
             if args.events:
@@ -216,6 +227,7 @@ def print_summary(
     lines = [
         ("frames", _join(read=detection.health.frames, used=counts.used, empty=counts.empty,
                          unknown=counts.unknown)),
+        *_ego_motion(detection),
         ("checksums", _join(right=counts.checksums_ok, wrong=counts.bad_crc)),
         ("rejected", _reasons(counts)),
         ("scans", _join(complete=counts.scans - counts.incomplete_scans,
@@ -230,6 +242,23 @@ def print_summary(
     for name, text in lines:
         console.print(f"  [dim]{name:<10}[/] {escape(text)}")
     _print_events(console, detection.events.found)
+
+
+def _ego_motion(detection: Detection) -> list[tuple[str, str]]:
+    """What was heard of the ego's motion, for a mode bank that asks for it, and of other sensors."""
+    counts = detection.node.decoder.counts
+    lines = []
+    if detection.node.detector.bank.road is not None:
+        lines.append(("ego motion", f"{counts.ego:,} frames"))
+        if not counts.ego:
+            lines[0] = (
+                "ego motion",
+                "not on this bus: nothing is said to stand still or to be oncoming, and when the "
+                "ego changes lane or turns the others seem to",
+            )
+    if counts.other_sensor:
+        lines.append(("others", f"{counts.other_sensor:,} frames of other sensors of the kind"))
+    return lines
 
 
 def _print_events(console: Console, events: list[Event]) -> None:

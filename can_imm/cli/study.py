@@ -6,6 +6,8 @@
   can-imm study bernoulli                      cooperative radars: errors over the parameters
   can-imm study roadside                       lidars beside the road: IMM-UKF and single models
   can-imm study tune-roadside                  how their constants were found
+  can-imm study motorway --profile ars408      motorway traffic: the preset motorway and rules
+  can-imm study tune-motorway-rules            how the rules' constants were found
 
 Studies report on seeds from 1000 on; everything was tuned on seeds below.
 """
@@ -18,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from can_imm.cli import study_bernoulli, study_roadside
+from can_imm.cli import study_bernoulli, study_motorway, study_roadside
 from can_imm.cli.study_common import (
     add_jobs,
     cell,
@@ -88,6 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     study_bernoulli.add_arguments(studies)
     study_roadside.add_arguments(studies)
+    study_motorway.add_arguments(studies)
 
 
 def run(args: argparse.Namespace) -> int:

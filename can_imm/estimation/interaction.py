@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numba
+import numpy as np
 
 from can_imm.estimation.constraints import normal_mass
 from can_imm.estimation.layout import FIXED, GROUND, SPEED_STEP
@@ -121,17 +122,50 @@ def transitions_(
                                 q += f * bank.F[m, i, s, t] * obj.P[i, k, t]
                     work.tx[s] = v
                     work.var[s] = q
-                base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work, work.tx[s])
+            intervals_(bank, j, work.tx, True, work)
+            for c in range(bank.n_bounds[j]):
+                s = bank.bound_state[j, c]
+                if not bank.bound_mass[j, c] or (bank.entry_sources[i, j] >> s & 1):
+                    continue
+                if not work.lower[c] < work.upper[c]:
+                    log_mass = -math.inf
+                    break
                 sd = math.sqrt(max(work.var[s], bank.var_floor))
                 log_mass += normal_mass(
-                    (base + bank.bound_lower[j, c] - work.tx[s]) / sd,
-                    (base + bank.bound_upper[j, c] - work.tx[s]) / sd,
+                    (work.lower[c] - work.tx[s]) / sd, (work.upper[c] - work.tx[s]) / sd
                 )
             if log_mass != 0.0:
                 obj.Pi[i, j] *= math.exp(log_mass)
             total += obj.Pi[i, j]
         for j in range(n_modes):
             obj.Pi[i, j] = obj.Pi[i, j] / total if total > 1e-30 else bank.Pi[m, i, j]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def intervals_(
+    bank: Any, j: int, x: FloatArray, only_mass: bool, work: Any
+) -> None:  # pragma: no cover - compiled
+    """The intervals of mode j's bounds around x into work.lower, work.upper.
+
+    Rows that bound the same state are one interval, written to the first of them; the others get
+    all numbers.  Where they contradict each other, lower is not below upper.
+
+    Args:
+        only_mass: rows without ``mass`` do not count.
+    """
+    for c in range(bank.n_bounds[j]):
+        work.lower[c] = -np.inf
+        work.upper[c] = np.inf
+        if only_mass and not bank.bound_mass[j, c]:
+            continue
+        s = bank.bound_state[j, c]
+        base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work, x[s])
+        first = c
+        for d in range(c - 1, -1, -1):
+            if bank.bound_state[j, d] == s and (bank.bound_mass[j, d] or not only_mass):
+                first = d
+        work.lower[first] = max(work.lower[first], base + bank.bound_lower[j, c])
+        work.upper[first] = min(work.upper[first], base + bank.bound_upper[j, c])
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -150,7 +184,8 @@ def reference(
     if kind == GROUND:
         ground: float = work.ground
         return ground
-    return nearest_lane(y, work.lane_width, lanes) * work.lane_width
+    centre: float = nearest_lane(y, work.lane_width, lanes) * work.lane_width
+    return centre
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)

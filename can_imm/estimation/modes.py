@@ -21,7 +21,7 @@ from can_imm.estimation.constraints import (
     project_,
     truncate_,
 )
-from can_imm.estimation.interaction import reference
+from can_imm.estimation.interaction import intervals_, reference
 from can_imm.estimation.kalman import log_normal, update_row_, update_state_
 from can_imm.estimation.layout import LOG_FLOOR
 from can_imm.estimation.noise import NoiseState, load, store_, uniform
@@ -160,16 +160,16 @@ def update_mode_(
     P = work.P[j]
     log_l = constrain_soft_(n, bank, j, x, P, work)
     n_bounds = bank.n_bounds[j]
-    prior = 0.0
+    # The lane is that of the prior, for the posterior too.
+    intervals_(bank, j, x, False, work)
+    empty = False
     for c in range(n_bounds):
-        s = bank.bound_state[j, c]
-        # The lane is that of the prior, for the posterior too.
-        base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work, x[s])
-        work.lower[c] = base + bank.bound_lower[j, c]
-        work.upper[c] = base + bank.bound_upper[j, c]
-    prior = mass_(n, x, P, n_bounds, bank.bound_state[j], bank.var_floor, work)
+        empty = empty or not work.lower[c] < work.upper[c]
+    prior = 0.0
+    if not empty:
+        prior = mass_(n, x, P, n_bounds, bank.bound_state[j], bank.var_floor, work)
     log_l += correct_(n, x, P, z, r, valid, age, work.angle, work.h, work.row)
-    if prior < LOG_MASS_FLOOR + 1.0:
+    if empty or prior < LOG_MASS_FLOOR + 1.0:
         return LOG_FLOOR  # the constraint contradicts the past beyond what numbers can tell
     posterior = 0.0
     if bank.is_projected[j]:

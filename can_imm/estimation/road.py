@@ -50,6 +50,7 @@ PARAMETERS = (
     "curvature_length",
     "change_std",
     "change_length",
+    "far_curvature",
     "bias_std",
     "mounting_std",
     "yaw_noise",
@@ -71,7 +72,8 @@ heading [rad], turning against the road [rad/s], curvature [1/m], its change [1/
 [rad/s] and mounting [rad]: how large they get; ``*_time`` [s] and ``*_length`` [m]: how long they
 stay the same; ``yaw_noise`` [rad/√s] of the heading from the yaw rate, and without it; ``drift``
 [m/√s] of the offset; ``wander_std`` [m] and ``wander_time`` [s] of a vehicle in its lane;
-``freedom`` [m/√s] of its place, and while it changes lanes; ``*_weight``: by how much
+``freedom`` [m/√s] of its place, and while it changes lanes; ``far_curvature`` [1/m]: how differently
+the road may bend beyond `FAR`; ``*_weight``: by how much
 more the variances of this estimate count than those of white noise, since its errors last;
 ``*_most`` [m, m/s]: no larger error is added to the measurements' noise: however little is known of
 where the lanes are far ahead, that a vehicle moves across them is seen.
@@ -79,7 +81,7 @@ where the lanes are far ahead, that a vehicle moves across them is seen.
 (
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,
     P_TURN_STD, P_TURN_TIME, P_CURVATURE_STD, P_CURVATURE_LENGTH, P_CHANGE_STD, P_CHANGE_LENGTH,
-    P_BIAS_STD, P_MOUNTING_STD, P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_WANDER_STD,
+    P_FAR_CURVATURE, P_BIAS_STD, P_MOUNTING_STD, P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_WANDER_STD,
     P_WANDER_TIME, P_FREEDOM, P_FREEDOM_CHANGING, P_ERROR_WEIGHT, P_ERROR_MOST, P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST,
 ) = range(len(PARAMETERS))  # fmt: skip
 
@@ -87,7 +89,7 @@ USUAL_SPEED = 25.0
 """Taken for the ego's where it is unknown [m/s]."""
 
 FAR = 100.0
-"""Beyond this distance [m] the road is taken to go on straight."""
+"""Beyond this distance [m] the curvature is taken to change no more."""
 
 SEEN_TO = 150.0
 """Vehicles further away [m] do not guide."""
@@ -226,8 +228,9 @@ def lane_row_(h: FloatArray, x: float) -> None:  # pragma: no cover - compiled
     far = min(max(x, 0.0), FAR)
     h[OFFSET] = -1.0
     h[HEADING] = -x
-    h[CURVATURE] = far * (x - 0.5 * far)
-    h[CHANGE] = 0.5 * far * far * (x - far / 1.5)
+    beyond = max(x, 0.0) - far
+    h[CURVATURE] = 0.5 * (far + beyond) ** 2
+    h[CHANGE] = far * (far * far / 6.0 + 0.5 * beyond * (far + beyond))
     h[BIAS] = 0.0
     h[MOUNTING] = -x
     h[WIDTH] = 0.0
@@ -239,8 +242,9 @@ def slope_row_(h: FloatArray, x: float) -> None:  # pragma: no cover - compiled
     far = min(max(x, 0.0), FAR)
     h[OFFSET] = 0.0
     h[HEADING] = -1.0
-    h[CURVATURE] = far
-    h[CHANGE] = 0.5 * far * far
+    beyond = max(x, 0.0) - far
+    h[CURVATURE] = far + beyond
+    h[CHANGE] = far * (0.5 * far + beyond)
     h[BIAS] = 0.0
     h[MOUNTING] = -1.0
     h[WIDTH] = 0.0
@@ -318,14 +322,19 @@ def localise_(
             continue
         y, vy = place(road, h, x, vx, speed)
         lane_row_(h, x)
-        error = min(par[P_ERROR_WEIGHT] * variance(P, h), par[P_ERROR_MOST] ** 2)
+        # Further on the road may bend in another way.
+        beyond = max(x - FAR, 0.0)
+        bend = 0.5 * par[P_FAR_CURVATURE] * beyond**2
+        error = par[P_ERROR_WEIGHT] * (variance(P, h) + bend**2)
+        error = min(error, par[P_ERROR_MOST] ** 2)
         z[k, 0] -= y * sin
         z[k, 2] -= y * cos
         r[k, 0] += error * sin * sin
         r[k, 2] += error * cos * cos
         if speed == speed:
             slope_row_(h, x)
-            error = par[P_SPEED_ERROR_WEIGHT] * variance(P, h) * (speed + vx) ** 2
+            bend = par[P_FAR_CURVATURE] * beyond
+            error = par[P_SPEED_ERROR_WEIGHT] * (variance(P, h) + bend**2) * (speed + vx) ** 2
             error = min(error, par[P_SPEED_ERROR_MOST] ** 2)
             z[k, 1] -= vy * sin
             z[k, 3] -= vy * cos
@@ -357,6 +366,15 @@ def begin_guide_(
         P[a, i] = v
         P[i, a] = v
     P[a, a] = variance(P, h) + r
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def add_width_(P: FloatArray, a: int, times: float) -> None:  # pragma: no cover - compiled
+    """What becomes of the covariance when so many widths are added to state a."""
+    for i in range(N):
+        P[a, i] += times * P[WIDTH, i]
+    for i in range(N):
+        P[i, a] += times * P[i, WIDTH]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -467,9 +485,11 @@ def watch_traffic_(
     if moved != 0:
         shift = moved * road[WIDTH]
         road[OFFSET] -= shift
+        add_width_(P, OFFSET, -moved)
         for g in range(N_GUIDES):
             if guide_slot[g] != FREE:
                 road[N_ROAD + g] -= shift
+                add_width_(P, N_ROAD + g, -moved)
         for s in range(objects.shape[0]):
             objects[s].mean[2] -= shift
             for j in range(bank[0].n_modes):

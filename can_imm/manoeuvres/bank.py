@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,15 @@ from can_imm.manoeuvres.motion import constant_speed, read_motion
 from can_imm.manoeuvres.particles import fill_particles
 from can_imm.manoeuvres.transitions import transitions_from_dwell, transitions_from_matrix
 from can_imm.tables import Table, builtin_names, read_table
-from can_imm.types import FloatArray, Manoeuvre
+from can_imm.types import CanImmError, FloatArray, Manoeuvre
 
 STATES = ("x", "vx", "y", "vy", "ax", "ay")
 PRESETS = Path(__file__).parent / "presets"
 LARGEST = 1e6
 """No number of a preset is larger: nothing on a road is, and nothing can overflow."""
+
+FIXED_STD = 0.02
+"""Standard deviation of a lane width or offset that is given [m]."""
 
 _MANOEUVRES = {m.name: m for m in Manoeuvre if m is not Manoeuvre.UNKNOWN}
 _OFF_LANE = (Manoeuvre.STATIONARY, Manoeuvre.ONCOMING)
@@ -65,17 +68,43 @@ def builtin_presets() -> list[str]:
     return builtin_names(PRESETS)
 
 
-def load_bank(name_or_path: str, *, step_ns: int = 10_000_000) -> ModeBank:
+def load_bank(
+    name_or_path: str,
+    *,
+    step_ns: int = 10_000_000,
+    lane_width: float | None = None,
+    lane_offset: float | None = None,
+) -> ModeBank:
     """Load a preset by name, or any TOML file by path.
 
     Args:
         step_ns: step of the loop [ns].
+        lane_width: of the road, if it is known and not to be learned [m].
+        lane_offset: how far to the left of the middle of its lane the ego usually is [m]; for a
+            preset with a [road].
 
     Raises:
-        CanImmError: the file is missing, is not TOML or does not describe a mode bank.
+        CanImmError: the file is missing, is not TOML or does not describe a mode bank, or a lane
+            that is none.
     """
     top = read_table(name_or_path, PRESETS, "preset", limit=LARGEST)
-    return _bank(top, step_ns, MAX_STEPS)
+    bank = _bank(top, step_ns, MAX_STEPS)
+    if lane_width is not None:
+        if not 2.0 <= lane_width <= 6.0:
+            raise CanImmError(f"the lanes' width must be 2 to 6 m, not {lane_width:g}")
+        bank.record["lane_width"], bank.record["lane_prior"] = lane_width, 0.0
+        bank = replace(bank, lane_width=lane_width)
+    for name, value in (("width", lane_width), ("offset", lane_offset)):
+        if value is None:
+            continue
+        if bank.road is not None:
+            bank.road[PARAMETERS.index(name)] = value
+            bank.road[PARAMETERS.index(f"{name}_std")] = FIXED_STD
+        elif name == "offset":
+            raise top.error("this preset has no [road], and so no offset of the lanes")
+    if lane_offset is not None and not abs(lane_offset) <= 3.0:
+        raise CanImmError(f"the lanes' offset must be -3 to 3 m, not {lane_offset:g}")
+    return bank
 
 
 def bank_from_dict(

@@ -73,7 +73,7 @@ class History:
         """Keep the road of this step."""
         if self.road is not None and len(reports):
             self._road_t_ns.append(t_ns)
-            self._roads.append(self.road.x.copy())
+            self._roads.append(self.road.x[:N_ROAD].copy())
 
     def __call__(self, t_ns: int, reports: npt.NDArray[Any]) -> None:
         rows = np.empty(len(reports), HISTORY_DTYPE)

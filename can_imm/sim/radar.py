@@ -18,8 +18,6 @@ from can_imm.types import VX, VY, BoolArray, CanImmError, FloatArray, Manoeuvre,
 
 MS = 1_000_000
 """[ns]"""
-_WANDER_TIME = 4.0
-"""Correlation time of the slowly wandering errors [s]."""
 _NEAREST = 1.0
 """What is nearer along x is not seen [m]."""
 _EGO_SPEED_STD, _EGO_YAW_STD, _EGO_YAW_BIAS = 0.05, 0.002, 0.003
@@ -38,6 +36,7 @@ class RadarModel:
         std: white noise; Cartesian: of x, vx, y, vy [m, m/s, m, m/s], NaN what it does not measure;
             polar: of range, range rate [m, m/s] and bearing [rad].
         wander: standard deviation of the slowly changing errors of x and y [m].
+        wander_time: their correlation time [s].
         slots: number of tracks that it can hold; their ids are 0 to slots - 1.
         in_turn: a new track takes the id after the last one given; otherwise the lowest free one.
         hold: a track whose object is out of view ends after so long [s].
@@ -56,6 +55,7 @@ class RadarModel:
     std: tuple[float, ...]
     polar: bool = False
     wander: tuple[float, float] = (0.0, 0.0)
+    wander_time: float = 1.0
     slots: int = 64
     in_turn: bool = True
     hold: float = 0.4
@@ -91,11 +91,11 @@ RADARS = {
             duplicates=0.003,
         ),
         RadarModel(
-            "toyota", 0.05, (0.15, 0.1, 0.15, _NAN), wander=(0.1, 0.1), slots=16, in_turn=False,
+            "toyota", 0.05, (0.08, 0.06, 0.08, _NAN), wander=(0.12, 0.2), wander_time=0.4, slots=16, in_turn=False,
             hold=0.0, rest=0.0, missed=0.01, dropout=0.002, duplicates=0.003,
         ),
         RadarModel(
-            "toyota-tss2", 0.05, (0.15, 0.1, 0.15, _NAN), wander=(0.1, 0.1), slots=16,
+            "toyota-tss2", 0.05, (0.08, 0.06, 0.08, _NAN), wander=(0.12, 0.2), wander_time=0.4, slots=16,
             in_turn=False, hold=0.0, rest=0.0, missed=0.01, dropout=0.002, duplicates=0.003,
         ),
         RadarModel(
@@ -189,7 +189,7 @@ class _Observer:
         std = np.array([*radar.std, 1.0][:4])
         self.valid = np.isfinite(std) & ([True, True, True, not radar.polar])
         self.std = np.where(self.valid, std, 1.0)
-        self.stay = exp(-radar.period / _WANDER_TIME)
+        self.stay = exp(-radar.period / radar.wander_time)
 
     def run(self) -> Measured:
         truth, radar, rng = self.truth, self.radar, self.rng

@@ -9,9 +9,12 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 from can_imm.types import CanImmError
+
+J = TypeVar("J")
+R = TypeVar("R")
 
 Work = Callable[[str], Any]
 """Does the job of this key; must be a module's function, its result something JSON can hold."""
@@ -93,6 +96,20 @@ def _finished(work: Work, todo: Sequence[str], jobs: int) -> Iterator[tuple[str,
             futures = {pool.submit(work, key): key for key in todo}
             for future in as_completed(futures):
                 yield futures[future], future.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def map_jobs(work: Callable[[J], R], todo: Sequence[J], jobs: int) -> Iterator[R]:
+    """The result of each job, in their order; ``work`` must be a module's function."""
+    if jobs == 1:
+        yield from map(work, todo)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, _leave_interrupts_to_the_parent) as pool:
+        try:
+            yield from pool.map(work, todo)
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise

@@ -8,15 +8,13 @@ the same noise.  The truths "A", "B" and "S" are the readings of the published s
 from __future__ import annotations
 
 import math
-import multiprocessing
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from can_imm.studies.metrics import Metrics, evaluate, summarise
+from can_imm.studies.montecarlo import map_jobs
 from can_imm.studies.runs import TRUTHS, Observation, play
 from can_imm.studies.systems import BASELINES, Answer, answer, bank
 
@@ -90,31 +88,13 @@ def study(
             bank(system)
     todo = [(truth, seed + k) for truth in truths for k in range(runs)]
     results = {(s, t): Result(s, t, []) for t in truths for s in systems}
-    for (truth, _), per_system in zip(todo, _map(partial(_run, systems), todo, jobs), strict=True):
+    for (truth, _), per_system in zip(
+        todo, map_jobs(partial(_run, systems), todo, jobs), strict=True
+    ):
         for system, metrics in zip(systems, per_system, strict=True):
             results[system, truth].metrics.extend(metrics)
         progress()
     return list(results.values())
-
-
-def _map(
-    work: Callable[[tuple[str, int]], list[list[Metrics]]], todo: list[tuple[str, int]], jobs: int
-) -> Iterator[list[list[Metrics]]]:
-    if jobs == 1:
-        yield from map(work, todo)
-        return
-    # spawn: the same on every platform, and no fork of a process with threads
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, _leave_interrupts_to_the_parent) as pool:
-        try:
-            yield from pool.map(work, todo)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-def _leave_interrupts_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def to_json(runs: int, seed: int, results: Sequence[Result]) -> dict[str, Any]:
@@ -128,11 +108,12 @@ def to_json(runs: int, seed: int, results: Sequence[Result]) -> dict[str, Any]:
 
 def _result(result: Result) -> dict[str, Any]:
     summary = summarise(result.metrics)
-    mean, error = (_fields({k: v[i] for k, v in summary.items()}) for i in (0, 1))
+    mean, error = (metric_fields({k: v[i] for k, v in summary.items()}) for i in (0, 1))
     return {"system": result.system, "truth": result.truth, **mean, "se": error}
 
 
-def _fields(values: dict[str, float]) -> dict[str, Any]:
+def metric_fields(values: dict[str, float]) -> dict[str, Any]:
+    """Metrics by name as they stand in JSON."""
     known = {k: round(v, 6) if math.isfinite(v) else None for k, v in values.items()}
     rmse = {state: known[f"rmse_{state}"] for state in TABLE_6}
     return {**{name: known[name] for name in _SCALARS}, "rmse": rmse}

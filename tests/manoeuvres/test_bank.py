@@ -15,7 +15,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from can_imm.estimation.layout import LANE, MAX_MODES
+from can_imm.estimation.layout import GROUND, LANE, MAX_MODES
+from can_imm.estimation.road import PARAMETERS
 from can_imm.manoeuvres import bank_from_dict, load_bank
 from can_imm.manoeuvres.bank import PRESETS
 from can_imm.types import CanImmError
@@ -131,9 +132,9 @@ def change(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
 EVEN = {"period_s": 0.1, "matrix": [[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]]}
 MANOEUVRE = (
     "'manoeuvre' must be one of KEEP_RIGHT, LANE_CHANGE, KEEP_LEFT, OVERTAKING, RECEDING, "
-    "APPROACHING, REAR_END"
+    "APPROACHING, REAR_END, KEEP_LANE, STATIONARY, ONCOMING"
 )
-MODEL = "'model' must be one of constant-velocity, singer, equation-33"
+MODEL = "'model' must be one of constant-velocity, damped, singer, equation-33"
 STATE = "'state' must be one of x, vx, y, vy, ax"
 
 REFUSALS = [
@@ -188,6 +189,19 @@ REFUSALS = [
     ("mode.0.soft.0.r", 0.0, "mode 'KEEP', soft 1: 'r'"),
     ("mode.0.soft.1.value", None, "mode 'KEEP', soft 2: 'value' is missing"),
     ("mode.0.soft.1.value", math.nan, "mode 'KEEP', soft 2: 'value'"),
+    ("mode.0.soft.1", {"state": "vx", "density": 0.0}, "mode 'KEEP', soft 2: 'density'"),
+    ("mode.0.soft.1", {"state": "vx", "density": 1.0, "r": 1.0, "value": 0.0}, "unknown key 'r'"),
+    ("mode.0.soft.0.ground", True, "mode 'KEEP', soft 1: 'ground' is for vx, without a lane"),
+    ("mode.0.soft.1.ground", "yes", "mode 'KEEP', soft 2: 'ground' must be true or false"),
+    ("mode.1.bounds.0.ground", True, "mode 'CHANGE', bounds 1: 'ground' is for vx"),
+    ("mode.0.soft.1", {"state": "vx", "ground": True, "lane": "left", "r": 1.0}, "'ground' is"),
+    ("mode.0.entry", [{"state": "vx", "ground": True, "mean": 0, "std": 1}], "unknown key 'ground'"),
+    ("mode.0.x.model", "damped", "mode 'KEEP', x: 'tau_s' is missing"),
+    ("mode.0.x", {"model": "damped", "tau_s": 0.0, "speed_std": 1.0}, "'tau_s'"),
+    ("mode.0.x", {"model": "damped", "tau_s": 1.0, "speed_std": -1.0}, "'speed_std'"),
+    ("rear_end_gap", -1.0, "'rear_end_gap'"),
+    ("road", {}, "road: 'width_std' is missing"),
+    ("road", 3.0, "'road' must be a table"),
     ("mode.0.soft", {}, "mode 'KEEP': 'soft' must be a list"),
     ("mode.0.soft", ["y"], "mode 'KEEP', soft 1: must be a table, not 'y'"),
     ("mode.0.soft", [{"state": "y", "value": 0.0, "r": 1.0}] * 5, "'soft' has 5 rows, at most 4"),
@@ -285,6 +299,76 @@ def check_line(text: str, file: str = "some.toml") -> None:
     assert len(text) < 400
 
 
+MOTORWAY = tomllib.loads((PRESETS / "motorway.toml").read_text(encoding="utf-8"))
+
+
+def test_the_table_of_a_road() -> None:
+    """In the order of the filter's parameters, after the lanes' width."""
+    bank = build(copy.deepcopy(MOTORWAY))
+    assert bank.road is not None
+    assert bank.road.tolist() == [
+        MOTORWAY["lanes"]["width"],
+        *(MOTORWAY["road"][name] for name in PARAMETERS[1:]),
+    ]
+    assert bank.record[0]["relative_lanes"]
+    assert not build(small()).record[0]["relative_lanes"]
+    assert build(small()).road is None
+
+
+@pytest.mark.parametrize("name", PARAMETERS[1:])
+def test_refusals_of_a_road(name: str) -> None:
+    for value in (None, "wide", math.nan, *(() if name == "offset" else (-0.1, 0.0))):
+        data = copy.deepcopy(MOTORWAY)
+        change(f"road.{name}", value)(data)
+        with pytest.raises(CanImmError, match=f"road: '{name}'") as e:
+            build(data)
+        check_line(str(e.value))
+
+
+def test_a_road_has_no_other_keys() -> None:
+    data = copy.deepcopy(MOTORWAY)
+    data["road"]["colour"] = "grey"
+    with pytest.raises(CanImmError, match="road: unknown key 'colour'"):
+        build(data)
+
+
+def test_rows_that_count_from_the_ground() -> None:
+    data = small()
+    data["mode"][0]["soft"][1] = {"state": "vx", "ground": True, "r": 0.1}
+    data["mode"][1]["bounds"][0] = {"state": "vx", "ground": True, "max": -1.5, "mass": True}
+    r = build(data).record[0]
+    assert (r["soft_kind"][0, 1], r["soft_value"][0, 1]) == (GROUND, 0.0)
+    assert (r["bound_kind"][1, 0], r["bound_upper"][1, 0]) == (GROUND, -1.5)
+    assert r["bound_kind"][1, 1] == LANE
+
+
+def test_a_row_with_a_density() -> None:
+    data = small()
+    data["mode"][0]["soft"][1] = {"state": "vx", "value": 0.5, "density": 0.02}
+    r = build(data).record[0]
+    assert r["soft_density"][0, :2].tolist() == [0, 1]
+    assert r["soft_r"][0, :2].tolist() == [0.3, 0.02]
+
+
+@pytest.mark.parametrize("tau", [0.3, 2.0, 50.0])
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_a_damped_speed(tau: float, axis: str) -> None:
+    """The integrated Ornstein-Uhlenbeck process, at one step and at many."""
+    data, sigma = small(), 0.7
+    data["mode"][0][axis] = {"model": "damped", "tau_s": tau, "speed_std": sigma}
+    r = build(data).record[0]
+    at = slice(0, 2) if axis == "x" else slice(2, 4)
+    for m in (1, 7, 11):
+        t = 0.01 * m
+        a = math.exp(-t / tau)
+        position = 2 * tau * t - tau**2 * (3.0 - 4.0 * a + a * a)
+        both = tau * (1.0 - a) ** 2
+        F = [[1.0, tau * (1.0 - a)], [0.0, a]]
+        Q = sigma**2 * np.array([[position, both], [both, 1.0 - a * a]])
+        np.testing.assert_allclose(r["F"][m, 0, at, at], F, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(r["Q"][m, 0, at, at], Q, rtol=1e-6, atol=1e-11)
+
+
 def test_too_many_modes() -> None:
     data = small()
     data["mode"] = [{**data["mode"][0], "name": f"M{i}"} for i in range(MAX_MODES + 1)]
@@ -327,7 +411,7 @@ def test_a_file_by_its_path(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "neither a file nor a built-in preset (paper, two-lane)"),
+        (None, "neither a file nor a built-in preset (motorway, paper, two-lane)"),
         (b"name = ", "not valid TOML"),
         (b"\xff\xfe\x00", "cannot be read: not a text file in UTF-8"),
         (b"a = " + b"[" * 5000, "not valid TOML"),
@@ -353,7 +437,9 @@ def test_a_directory_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_unknown_preset_names_the_known_ones() -> None:
-    with pytest.raises(CanImmError, match=r"three-lane: neither .* preset \(paper, two-lane\)"):
+    with pytest.raises(
+        CanImmError, match=r"three-lane: neither .* preset \(motorway, paper, two-lane\)"
+    ):
         load_bank("three-lane")
 
 

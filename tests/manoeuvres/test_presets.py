@@ -8,11 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from can_imm.estimation.layout import FIXED
+from can_imm.estimation.layout import FIXED, GROUND, LANE
 from can_imm.manoeuvres import Manoeuvre, ModeBank, builtin_presets, load_bank
 
 STATES = ["x", "vx", "y", "vy", "ax", "ay"]
-NAMES = [m.name for m in Manoeuvre if m is not Manoeuvre.UNKNOWN]
+TWO_LANES = [m for m in Manoeuvre if Manoeuvre.KEEP_RIGHT <= m <= Manoeuvre.REAR_END]
+NAMES = [m.name for m in TWO_LANES]
+MOTORWAY = [
+    Manoeuvre.LANE_CHANGE,
+    *(m for m in Manoeuvre if m >= Manoeuvre.RECEDING),
+]
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +44,7 @@ def bounds(bank: ModeBank, j: int) -> dict[str, tuple[float, float]]:
 
 
 def test_names() -> None:
-    assert builtin_presets() == ["paper", "two-lane"]
+    assert builtin_presets() == ["motorway", "paper", "two-lane"]
 
 
 def test_paper_table_2(paper: ModeBank) -> None:
@@ -131,7 +136,8 @@ def test_every_preset(name: str) -> None:
     r = bank.record[0]
     m, n = len(bank.modes), bank.n_states
     assert bank.name == name
-    assert set(bank.manoeuvres) == set(Manoeuvre) - {Manoeuvre.UNKNOWN}
+    said = set(bank.manoeuvres) | ({Manoeuvre.REAR_END} if r["rear_end_gap"] > 0.0 else set())
+    assert said == set(MOTORWAY if name == "motorway" else TWO_LANES)
     np.testing.assert_allclose(r["Pi"][:, :m, :m].sum(axis=2), 1.0, rtol=1e-12)
     assert (r["Pi"] >= 0.0).all()
     assert (r["Pi"][:, m:] == 0.0).all()
@@ -160,6 +166,41 @@ def test_two_lane_can_go_from_keeping_right_to_overtaking() -> None:
     keep = [j for j, m in enumerate(bank.manoeuvres) if m is Manoeuvre.KEEP_RIGHT]
     over = [j for j, m in enumerate(bank.manoeuvres) if m is Manoeuvre.OVERTAKING]
     assert Pi[np.ix_(keep, over)].sum() > 1e-4
+
+
+def test_motorway() -> None:
+    """Both directions; what stands or comes needs the ground; nobody else stands or comes."""
+    bank = load_bank("motorway")
+    r: Any = bank.record[0]
+    changes = [
+        int(d)
+        for m, d in zip(bank.manoeuvres, bank.direction, strict=True)
+        if m is Manoeuvre.LANE_CHANGE
+    ]
+    assert sorted(set(changes)) == [-1, 1]
+    assert bank.road is not None
+    assert bank.n_particles == 0
+    assert r["relative_lanes"]
+    for j, manoeuvre in enumerate(bank.manoeuvres):
+        off_lane = manoeuvre in (Manoeuvre.STATIONARY, Manoeuvre.ONCOMING)
+        assert r["off_lane"][j] == off_lane
+        grounded = r["bound_kind"][j, : r["n_bounds"][j]] == GROUND
+        assert (r["bound_mass"][j, : r["n_bounds"][j]][grounded] == 1).all()
+        if off_lane:
+            assert grounded.any(), "without the ego's speed it is never said"
+        for c in np.flatnonzero(grounded):
+            low, high = r["bound_lower"][j, c], r["bound_upper"][j, c]
+            if manoeuvre is Manoeuvre.STATIONARY:
+                assert low < 0.0 < high
+            elif manoeuvre is Manoeuvre.ONCOMING:
+                assert high < 0.0
+            else:
+                assert low > 0.0
+        lanes = r["soft_kind"][j, : r["n_soft"][j]] == LANE
+        assert (r["soft_lanes"][j, : r["n_soft"][j]][lanes] == [-9, 9]).all()
+    # every mode can be reached from every other one
+    m = len(bank.modes)
+    assert (r["Pi"][200, :m, :m] > 0.0).all()
 
 
 @pytest.mark.parametrize("step_ms", [5, 10, 20, 50])

@@ -1,0 +1,219 @@
+"""What the preset motorway has to beat: one Kalman filter per track, and thresholds on its state.
+
+The constants were found by ``can-imm study tune-motorway-rules``, on seeds below 1000, for every
+profile by itself; for straight roads there are others.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from can_imm.studies.runs import Int8Array
+from can_imm.types import VX, VY, BoolArray, FloatArray, IntArray, Manoeuvre, X, Y
+
+MAX_LANE = 7
+
+
+class Rules(NamedTuple):
+    """Filter and thresholds.  In order: ONCOMING, STATIONARY, LANE_CHANGE, REAR_END, APPROACHING,
+    RECEDING, KEEP_LANE."""
+
+    q_along: float
+    """White-noise acceleration along the road [m²/s³]."""
+    q_across: float
+    """White-noise acceleration across the road [m²/s³]."""
+    curvature: float
+    """Share of the curvature that is believed (0: a straight road)."""
+    yaw_tau: float
+    """Time constant of the yaw rate's low pass [s]."""
+    common: float
+    """Share in which the direction that all others take is put down to the ego's heading."""
+    width: float
+    """Of the lanes [m]."""
+    lane_vy: float
+    """LANE_CHANGE above this lateral speed, either way [m/s] ..."""
+    lane_vy_far: float
+    """... plus this, per 100 m of distance [m/s] ..."""
+    lane_border: float
+    """... or nearer to the border between two lanes than this [m] ..."""
+    border_x: float
+    """... at a distance up to this [m]."""
+    lane_end: float
+    """While it is being said, this share of that speed suffices."""
+    lane_dwell: int
+    """Frames in a row that must agree before it is said ..."""
+    lane_hold: int
+    """... and on its end."""
+    receding: float
+    """RECEDING above this vx [m/s] ..."""
+    receding_end: float
+    """... until below this."""
+    approaching: float
+    """APPROACHING below minus this vx [m/s] ..."""
+    approaching_end: float
+    """... until above minus this."""
+    speed_dwell: int
+    """Frames in a row that must agree on another one of these classes."""
+    rear_end_x: float
+    """REAR_END up to this gap in the ego's lane [m]."""
+    stationary: float
+    """STATIONARY below this speed over ground [m/s], either way."""
+    oncoming: float
+    """ONCOMING above this speed over ground against our direction [m/s]."""
+
+
+START = Rules(
+    q_along=0.15, q_across=0.3, curvature=0.75, yaw_tau=1.4, common=0.75, width=3.6,
+    lane_vy=0.6, lane_vy_far=0.15, lane_border=0.4, border_x=50.0, lane_end=0.5,
+    lane_dwell=4, lane_hold=4,
+    receding=0.5, receding_end=0.35, approaching=0.5, approaching_end=0.35, speed_dwell=1,
+    rear_end_x=10.0, stationary=3.0, oncoming=3.0,
+)  # fmt: skip
+"""Where the search for the others began."""
+
+RULES: dict[str, Rules] = {
+    "can_imm": Rules(
+        q_along=0.104, q_across=0.328, curvature=0.75, yaw_tau=1.59, common=0.75, width=3.7,
+        lane_vy=0.747, lane_vy_far=0.233, lane_border=0.141, border_x=98.6, lane_end=0.528,
+        lane_dwell=4, lane_hold=4,
+        receding=0.391, receding_end=0.421, approaching=0.457, approaching_end=0.446, speed_dwell=1,
+        rear_end_x=9.97, stationary=3.0, oncoming=3.0,
+    ),
+    "ars408": Rules(
+        q_along=0.0995, q_across=0.52, curvature=0.75, yaw_tau=3.18, common=0.75, width=3.8,
+        lane_vy=0.849, lane_vy_far=0.385, lane_border=0.0897, border_x=10.4, lane_end=0.206,
+        lane_dwell=2, lane_hold=2,
+        receding=0.391, receding_end=0.421, approaching=0.457, approaching_end=0.426, speed_dwell=1,
+        rear_end_x=9.97, stationary=3.0, oncoming=3.0,
+    ),
+    "toyota": Rules(
+        q_along=0.605, q_across=0.451, curvature=0.0, yaw_tau=2.63, common=1.0, width=3.4,
+        lane_vy=0.934, lane_vy_far=0.308, lane_border=0.108, border_x=11.3, lane_end=0.697,
+        lane_dwell=3, lane_hold=1,
+        receding=0.355, receding_end=0.236, approaching=0.442, approaching_end=0.355, speed_dwell=1,
+        rear_end_x=9.97, stationary=3.0, oncoming=3.0,
+    ),
+    "toyota-tss2": Rules(
+        q_along=0.532, q_across=0.121, curvature=0.0, yaw_tau=1.4, common=1.0, width=3.6,
+        lane_vy=0.9, lane_vy_far=0.259, lane_border=0.303, border_x=10.9, lane_end=0.75,
+        lane_dwell=6, lane_hold=1,
+        receding=0.35, receding_end=0.233, approaching=0.5, approaching_end=0.245, speed_dwell=1,
+        rear_end_x=10.0, stationary=3.0, oncoming=3.0,
+    ),
+}  # fmt: skip
+"""By profile, for all roads."""
+PLAIN_RULES: dict[str, Rules] = {
+    "can_imm": Rules(
+        q_along=0.138, q_across=0.201, curvature=0.0, yaw_tau=1.75, common=0.25, width=3.6,
+        lane_vy=0.415, lane_vy_far=0.0168, lane_border=0.454, border_x=78.9, lane_end=0.796,
+        lane_dwell=3, lane_hold=4,
+        receding=0.469, receding_end=0.401, approaching=0.402, approaching_end=0.355, speed_dwell=1,
+        rear_end_x=9.97, stationary=3.0, oncoming=3.0,
+    ),
+    "ars408": Rules(
+        q_along=0.17, q_across=0.167, curvature=0.0, yaw_tau=1.4, common=0.5, width=3.6,
+        lane_vy=0.4, lane_vy_far=0.0273, lane_border=0.4, border_x=50.0, lane_end=0.75,
+        lane_dwell=3, lane_hold=4,
+        receding=0.5, receding_end=0.35, approaching=0.5, approaching_end=0.28, speed_dwell=1,
+        rear_end_x=10.0, stationary=3.0, oncoming=3.0,
+    ),
+    "toyota": Rules(
+        q_along=0.247, q_across=0.252, curvature=0.0, yaw_tau=1.75, common=0.25, width=3.6,
+        lane_vy=0.622, lane_vy_far=0.0553, lane_border=0.599, border_x=148.0, lane_end=1.04,
+        lane_dwell=1, lane_hold=1,
+        receding=0.287, receding_end=0.185, approaching=0.268, approaching_end=0.158, speed_dwell=1,
+        rear_end_x=9.97, stationary=3.0, oncoming=3.0,
+    ),
+    "toyota-tss2": Rules(
+        q_along=0.247, q_across=0.0849, curvature=0.0, yaw_tau=1.75, common=0.25, width=3.6,
+        lane_vy=0.934, lane_vy_far=0.0486, lane_border=0.715, border_x=108.0, lane_end=0.464,
+        lane_dwell=1, lane_hold=1,
+        receding=0.287, receding_end=0.185, approaching=0.268, approaching_end=0.158, speed_dwell=1,
+        rear_end_x=9.97, stationary=3.0, oncoming=3.0,
+    ),
+}  # fmt: skip
+"""By profile, for straight roads and a constant speed of the ego."""
+
+
+def rules_for(profile: str, *, plain: bool) -> Rules:
+    """The constants for a profile's radar, on straight roads or on all."""
+    return (PLAIN_RULES if plain else RULES).get(profile, START)
+
+
+_KEEP, _CHANGE = int(Manoeuvre.KEEP_LANE), int(Manoeuvre.LANE_CHANGE)
+_RECEDING, _APPROACHING = int(Manoeuvre.RECEDING), int(Manoeuvre.APPROACHING)
+_REAR_END = int(Manoeuvre.REAR_END)
+_STATIONARY, _ONCOMING = int(Manoeuvre.STATIONARY), int(Manoeuvre.ONCOMING)
+
+
+@njit(cache=True)
+def _changing(x: FloatArray, lane: float, said: int, r: Rules) -> int:
+    """Direction of a lane change, 0 for none, given what is being said."""
+    limit = r.lane_vy + r.lane_vy_far * x[X] / 100.0
+    if said:
+        limit *= r.lane_end
+    border = (0.5 - abs(x[Y] / r.width - lane)) * r.width
+    if abs(x[VY]) > limit or (border < r.lane_border and x[X] <= r.border_x):
+        return 1 if x[VY] > 0.0 else -1
+    return 0
+
+
+@njit(cache=True)
+def _relation(vx: float, said: int, r: Rules) -> int:
+    """RECEDING, APPROACHING or KEEP_LANE, given what is being said."""
+    if vx > (r.receding_end if said == _RECEDING else r.receding):
+        return _RECEDING
+    if vx < -(r.approaching_end if said == _APPROACHING else r.approaching):
+        return _APPROACHING
+    return _KEEP
+
+
+@njit(cache=True)
+def judge(
+    ids: IntArray, speed: FloatArray, x: FloatArray, begins: BoolArray, r: Rules
+) -> tuple[Int8Array, Int8Array, Int8Array]:
+    """What the thresholds say: `Manoeuvre` values, directions and lanes, (F,) each.
+
+    Args:
+        ids, speed, x, begins: (F,), (F,), (F, 4), (F,) as in `Frames` and from `follow`.
+    """
+    n = len(x)
+    said, directions, lanes = np.empty(n, np.int8), np.zeros(n, np.int8), np.empty(n, np.int8)
+    slots = ids.max() + 1 if n else 0
+    relation, other = np.zeros(slots, np.int64), np.zeros(slots, np.int64)
+    agreeing = np.zeros(slots, np.int64)
+    change, moving = np.zeros(slots, np.int64), np.zeros(slots, np.int64)
+    for k in range(n):
+        i = ids[k]
+        lane = float(np.rint(x[k, Y] / r.width))
+        lanes[k] = int(min(max(lane, -MAX_LANE), MAX_LANE))
+        now = _relation(x[k, VX], relation[i], r)
+        if begins[k]:
+            relation[i], other[i], agreeing[i] = now, now, 0
+            change[i] = moving[i] = 0
+        agreeing[i] = agreeing[i] + 1 if now == other[i] else 1
+        other[i] = now
+        if agreeing[i] >= r.speed_dwell:
+            relation[i] = now
+        now = _changing(x[k], lane, change[i], r)
+        # frames that speak against what is being said
+        moving[i] = moving[i] + 1 if (now != 0) != (change[i] != 0) else 0
+        if change[i] and now:
+            change[i] = now
+        elif moving[i] >= (r.lane_hold if change[i] else r.lane_dwell):
+            change[i], moving[i] = now, 0
+        ground = speed[k] + x[k, VX]
+        if ground < -r.oncoming:
+            said[k] = _ONCOMING
+        elif abs(ground) < r.stationary:
+            said[k] = _STATIONARY
+        elif change[i]:
+            said[k], directions[k] = _CHANGE, change[i]
+        elif relation[i] == _APPROACHING and lane == 0.0 and x[k, X] <= r.rear_end_x:
+            said[k] = _REAR_END
+        else:
+            said[k] = relation[i]
+    return said, directions, lanes
