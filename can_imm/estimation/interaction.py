@@ -7,7 +7,7 @@ from typing import Any
 
 import numba
 
-from can_imm.estimation.constraints import normal_mass
+from can_imm.estimation.constraints import normal_probability
 from can_imm.estimation.layout import FIXED, SPEED_STEP
 from can_imm.types import VX, FloatArray, X
 
@@ -97,14 +97,12 @@ def transitions_(
     """
     n_modes = bank.n_modes
     for i in range(n_modes):
-        for j in range(n_modes):
-            work.Pi[i, j] = bank.Pi[m, i, j]
         if work.mu[i] == 0.0:
             continue
         done = 0  # bits of the states that have been moved on
         total = 0.0
         for j in range(n_modes):
-            log_mass = 0.0
+            p = bank.Pi[m, i, j]
             for c in range(bank.n_bounds[j]):
                 s = bank.bound_state[j, c]
                 if not bank.bound_mass[j, c] or (bank.entry_sources[i, j] >> s & 1):
@@ -120,20 +118,23 @@ def transitions_(
                             for t in range(n):
                                 q += f * bank.F[m, i, s, t] * obj.P[i, k, t]
                     work.tx[s] = v
-                    work.var[s] = q
-                base = reference(
+                    work.var[s] = 1.0 / math.sqrt(max(q, bank.var_floor))
+                base = work.tx[s] - reference(
                     bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, work.tx[s]
                 )
-                sd = math.sqrt(max(work.var[s], bank.var_floor))
-                log_mass += normal_mass(
-                    (base + bank.bound_lower[j, c] - work.tx[s]) / sd,
-                    (base + bank.bound_upper[j, c] - work.tx[s]) / sd,
+                p *= normal_probability(
+                    (bank.bound_lower[j, c] - base) * work.var[s],
+                    (bank.bound_upper[j, c] - base) * work.var[s],
                 )
-            if log_mass != 0.0:
-                work.Pi[i, j] *= math.exp(log_mass)
-            total += work.Pi[i, j]
-        for j in range(n_modes):
-            work.Pi[i, j] = work.Pi[i, j] / total if total > 1e-30 else bank.Pi[m, i, j]
+            work.Pi[i, j] = p
+            total += p
+        if total > 1e-30:
+            scale = 1.0 / total
+            for j in range(n_modes):
+                work.Pi[i, j] *= scale
+        else:
+            for j in range(n_modes):
+                work.Pi[i, j] = bank.Pi[m, i, j]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)

@@ -110,23 +110,26 @@ def update_row_(
 def update_state_(
     n: int, x: FloatArray, P: FloatArray, i0: int, z: float, r: float, work: FloatArray
 ) -> tuple[float, float]:  # pragma: no cover - compiled
-    """`update_row_` for a row that selects the single state ``i0``; several times cheaper."""
+    """`update_row_` for a row that selects the single state ``i0``; several times cheaper.
+
+    The row of the state itself is scaled by r / s, which is where the Joseph form's digits matter.
+    """
     s = P[i0, i0] + r
     e = z - x[i0]
     if not (s > 0.0 and s < np.inf and abs(e) < np.inf):
         return e, np.nan
+    g = 1.0 / s
     for i in range(n):
         work[0, i] = P[i, i0]
-        work[1, i] = P[i, i0] / s
+        work[1, i] = P[i, i0] * g
         x[i] += work[1, i] * e
     for i in range(n):
         for j in range(i + 1):
-            v = (
-                P[i, j]
-                - work[1, i] * work[0, j]
-                - work[0, i] * work[1, j]
-                + work[1, i] * s * work[1, j]
-            )
+            v = P[i, j] - work[1, i] * work[0, j]
             P[i, j] = v
             P[j, i] = v
+    for i in range(n):
+        v = work[1, i] * r
+        P[i, i0] = v
+        P[i0, i] = v
     return e, s

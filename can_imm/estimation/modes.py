@@ -9,6 +9,7 @@ so that modes whose constraints have different dimensions stay comparable.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numba
@@ -21,7 +22,7 @@ from can_imm.estimation.constraints import (
     truncate_,
 )
 from can_imm.estimation.interaction import reference
-from can_imm.estimation.kalman import log_normal, update_row_, update_state_
+from can_imm.estimation.kalman import LOG_2PI, update_row_, update_state_
 from can_imm.estimation.layout import LOG_FLOOR
 from can_imm.estimation.noise import NoiseState, load, store_, uniform
 from can_imm.estimation.particles import (
@@ -78,13 +79,18 @@ def correct_(
     Returns:
         Log density of z; NaN on a numeric failure.
     """
-    log_l = 0.0
+    # one logarithm for all components
+    square = 0.0
+    product = 1.0
+    count = 0
     for c in range(4):
         if not valid[c]:
             continue
+        count += 1
         if age == 0.0:
             e, v = update_state_(n, x, P, c, z[c], r[c], row)
-            log_l += log_normal(e, v)
+            square += e * e / v
+            product *= v
             continue
         for s in range(n):
             h[s] = 0.0
@@ -97,8 +103,9 @@ def correct_(
         elif a < n:
             h[a] = -age
         e, v = update_row_(n, x, P, h, z[c], r[c], row)
-        log_l += log_normal(e, v)
-    return log_l
+        square += e * e / v
+        product *= v
+    return -0.5 * (count * LOG_2PI + math.log(product) + square)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -112,12 +119,14 @@ def mass_(
     """
     if n_bounds == 0:
         return 0.0
+    last = n_bounds - 1
+    if last == 0:
+        return interval_mass(x, P, state[0], work.lower[0], work.upper[0])
     for s in range(n):
         work.tx[s] = x[s]
         for t in range(n):
             work.tP[s, t] = P[s, t]
     log_mass = 0.0
-    last = n_bounds - 1
     for c in range(last):
         log_mass += truncate_(
             n, work.tx, work.tP, state[c], work.lower[c], work.upper[c], floor, work.row
