@@ -13,9 +13,10 @@ import numba
 import numpy as np
 
 from can_imm.estimation.constraints import normal_mass
-from can_imm.estimation.interaction import mix_, reference, transitions_
+from can_imm.estimation.interaction import mix_, nearest_lane, reference, transitions_
 from can_imm.estimation.kalman import predict_
 from can_imm.estimation.layout import (
+    GROUND,
     LANE,
     LOG_FLOOR,
     NEGLIGIBLE_WEIGHT,
@@ -114,7 +115,7 @@ def learn_lane_(bank: Any, obj: Any) -> None:  # pragma: no cover - compiled
             if bank.soft_kind[j, c] != LANE:
                 continue
             y = obj.x[j, bank.soft_state[j, c]]
-            k = reference(LANE, bank.soft_lanes[j, c], 1.0, y / obj.lane_width)
+            k = nearest_lane(y, obj.lane_width, bank.soft_lanes[j, c])
             if k != 0.0:
                 obj.lane_scans = min(obj.lane_scans + 1.0, 10.0 * bank.lane_prior)
                 gain = 1.0 / (bank.lane_prior + obj.lane_scans)
@@ -124,7 +125,14 @@ def learn_lane_(bank: Any, obj: Any) -> None:  # pragma: no cover - compiled
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def surprise(
-    bank: Any, obj: Any, m: int, z: FloatArray, r: FloatArray, valid: Any, age: float
+    bank: Any,
+    obj: Any,
+    m: int,
+    z: FloatArray,
+    r: FloatArray,
+    valid: Any,
+    age: float,
+    angle: float,
 ) -> float:  # pragma: no cover - compiled
     """Squared distance of z from where the object can be, in standard deviations.
 
@@ -133,12 +141,22 @@ def surprise(
     """
     d = 0.0
     tau = m * bank.step_s - age
+    cos, sin = 1.0, 0.0
+    if angle != 0.0:
+        cos, sin = math.cos(angle), math.sin(angle)
     for c in range(4):
         if valid[c]:
-            e = z[c] - obj.mean[c]
-            if c == 0 or c == 2:
-                e -= tau * obj.mean[c + 1]
-            d += e * e / (obj.cov[c, c] + r[c] + bank.jump_std[c] ** 2)
+            # shares of the two axes in the measured component
+            f = cos if c < 2 else -sin
+            g = sin if c < 2 else cos
+            a = c % 2  # 0 a position, 1 a speed
+            b = a + 2
+            e = z[c] - f * obj.mean[a] - g * obj.mean[b]
+            if a == 0:
+                e -= tau * (f * obj.mean[1] + g * obj.mean[3])
+            v = f * f * (obj.cov[a, a] + bank.jump_std[a] ** 2)
+            v += g * g * (obj.cov[b, b] + bank.jump_std[b] ** 2) + 2.0 * f * g * obj.cov[a, b]
+            d += e * e / (v + r[c])
     return d
 
 
@@ -162,7 +180,8 @@ def cycle_(
     """One IMM cycle of one object, in place.
 
     Args:
-        bank, obj, work: records of `BANK_DTYPE`, `OBJECT_DTYPE`, `WORK_DTYPE`.
+        bank, obj, work: records of `BANK_DTYPE`, `OBJECT_DTYPE`, `WORK_DTYPE`; work.angle and
+            work.ground are given, too.
         m: steps since the object's last measurement.
         z, r: (4,) measured x, vx, y, vy and their variances.  valid: (4,) bool.
         age: of the measurement [s].
@@ -175,7 +194,7 @@ def cycle_(
         OK; OUTLIER or FAILED with the object as it was before (a failed mode alone gets the floor).
     """
     n_modes = bank.n_modes
-    if surprise(bank, obj, m, z, r, valid, age) > gate:
+    if surprise(bank, obj, m, z, r, valid, age, work.angle) > gate:
         return OUTLIER
     work.lane_width = obj.lane_width
     present_(bank, obj, work.mu)
@@ -228,9 +247,9 @@ def birth_(
     are honest ones.  Regions count with the mass that the measurement alone gives them.
     """
     n_modes, n = bank.n_modes, bank.n_states
-    obj.lane_width = bank.lane_width
+    cos, sin = math.cos(work.angle), math.sin(work.angle)
     obj.lane_scans = 0.0
-    work.lane_width = bank.lane_width
+    work.lane_width = obj.lane_width
     for j in range(n_modes):
         x = work.x[j]
         P = work.P[j]
@@ -239,23 +258,27 @@ def birth_(
             for t in range(n):
                 P[s, t] = 0.0
             P[s, s] = bank.birth_std[s] ** 2
-            if s < 4 and s % 2 == 0 and valid[s]:
-                x[s] = z[s]
+            if s == 0 and valid[s]:
+                x[s] = z[0] * cos - (z[2] * sin if valid[2] else 0.0)
+            elif s == 2 and valid[s]:
+                x[s] = z[2] * cos + (z[0] * sin if valid[0] else 0.0)
             if bank.entry_var[j, s] >= 0.0:
                 x[s] = bank.entry_mean[j, s]
                 P[s, s] = bank.entry_var[j, s]
         work.c[j] = bank.mu0[j]
         for c in range(bank.n_bounds[j]):
             s = bank.bound_state[j, c]
-            if bank.bound_mass[j, c] and s < 4 and valid[s]:
-                base = reference(
-                    bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, z[s]
-                )
-                sd = math.sqrt(r[s])
+            # Of a speed that is not measured the prior says enough to tell what stands still.
+            known = valid[s] or bank.bound_kind[j, c] == GROUND
+            if bank.bound_mass[j, c] and s < 4 and known:
+                # Turned axes: a speed along the line of sight is taken as one along the road.
+                v = z[s] if s % 2 == 1 and valid[s] else x[s]
+                base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work, v)
+                sd = math.sqrt(r[s]) if valid[s] else bank.birth_std[s]
                 work.c[j] *= math.exp(
                     normal_mass(
-                        (base + bank.bound_lower[j, c] - z[s]) / sd,
-                        (base + bank.bound_upper[j, c] - z[s]) / sd,
+                        (base + bank.bound_lower[j, c] - v) / sd,
+                        (base + bank.bound_upper[j, c] - v) / sd,
                     )
                 )
         log_l = update_mode_(n, bank, work, j, z, r, valid, age)
@@ -320,6 +343,9 @@ def process_scan_(
     z: FloatArray,
     r: FloatArray,
     valid: Any,
+    angle: FloatArray,
+    ground: float,
+    lane_width: float,
     age: float,
     gate: float,
     particles: FloatArray,
@@ -335,14 +361,23 @@ def process_scan_(
         n: rows in use.  slot: (N,) int32, -1 for none.
         steps: (N,) int32, steps since the slot's last measurement; -1 for a birth.
         z, r: (N, 4) measured values and variances.  valid: (N, 4) bool.
+        angle: (N,) of the axes in which they were measured [rad].
+        ground: speed of the ground against the ego vehicle, or `UNKNOWN_GROUND` [m/s].
+        lane_width: of the road [m]; 0 leaves it to each object.
         age, gate, spare, weights, noise: as for `cycle_`.
         particles: (capacity, n_particles, 7).
         status: (N,) int8, written: OK, OUTLIER or FAILED.
     """
+    work[0].ground = ground
     for k in range(n):
         s = slot[k]
         if s < 0:
             continue
+        work[0].angle = angle[k]
+        if lane_width > 0.0:
+            objects[s].lane_width = lane_width
+        elif steps[k] < 0:
+            objects[s].lane_width = bank[0].lane_width
         if steps[k] < 0:
             status[k] = birth_(bank[0], objects[s], work[0], z[k], r[k], valid[k], age)
             continue

@@ -8,7 +8,7 @@ from typing import Any
 import numba
 
 from can_imm.estimation.constraints import normal_probability
-from can_imm.estimation.layout import FIXED, SPEED_STEP
+from can_imm.estimation.layout import FIXED, GROUND, SPEED_STEP
 from can_imm.types import VX, FloatArray, X
 
 
@@ -120,7 +120,7 @@ def transitions_(
                     work.tx[s] = v
                     work.var[s] = 1.0 / math.sqrt(max(q, bank.var_floor))
                 base = work.tx[s] - reference(
-                    bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, work.tx[s]
+                    bank.bound_kind[j, c], bank.bound_lanes[j, c], work, work.tx[s]
                 )
                 p *= normal_probability(
                     (bank.bound_lower[j, c] - base) * work.var[s],
@@ -139,14 +139,25 @@ def transitions_(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def reference(
-    kind: int, lanes: FloatArray, width: float, y: float
+    kind: int, lanes: FloatArray, work: Any, y: float
 ) -> float:  # pragma: no cover - compiled
-    """What a row's numbers count from: 0, or the centre of the lane nearest to ``y``.
+    """What a row's numbers count from: 0, the centre of the lane nearest to ``y``, or the ground.
 
     Args:
-        lanes: (2,) lowest and highest number of the lanes that count; lane k lies at k times width.
+        lanes: (2,) lowest and highest number of the lanes that count; lane k lies at k times the
+            width.
+        work: ``lane_width`` [m] and ``ground``, the speed of the ground against the ego [m/s].
     """
     if kind == FIXED:
         return 0.0
+    if kind == GROUND:
+        ground: float = work.ground
+        return ground
+    return nearest_lane(y, work.lane_width, lanes) * work.lane_width
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def nearest_lane(y: float, width: float, lanes: FloatArray) -> float:  # pragma: no cover - compiled
+    """Number of the lane nearest to ``y`` [m], of those from lanes[0] to lanes[1]."""
     lane: float = min(max(math.floor(y / width + 0.5), lanes[0]), lanes[1])
-    return lane * width
+    return lane

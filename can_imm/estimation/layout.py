@@ -21,8 +21,13 @@ MAX_ROWS = 4
 SPEED_STEP = 1 << VX
 """Bit of ``entry_sources``: the entry replaces the speed ahead."""
 
-FIXED, LANE = 0, 1
-"""What the numbers of a row refer to: zero, or the nearest lane centre in a range of lanes."""
+FIXED, LANE, GROUND = 0, 1, 2
+"""What the numbers of a row refer to: zero, the nearest lane centre in a range of lanes, or the
+speed at which what stands still moves relative to the ego vehicle."""
+
+UNKNOWN_GROUND = -1e3
+"""Stands for the speed of the ground [m/s] where the ego's is unknown: nothing moves like that, so
+that what stands still or comes towards us is never claimed."""
 
 
 MAX_MODES = 24
@@ -54,6 +59,7 @@ BANK_DTYPE = np.dtype(
         ("lane_width", np.float64),
         ("lane_range", np.float64, (2,)),
         ("lane_prior", np.float64),
+        ("rear_end_gap", np.float64),
         ("soft_value", np.float64, (_M, _K)),
         ("soft_lanes", np.float64, (_M, _K, 2)),
         ("soft_r", np.float64, (_M, _K)),
@@ -85,6 +91,7 @@ BANK_DTYPE = np.dtype(
 Tables are indexed by the number of elapsed steps: ``F[m]``, ``Q[m]``, ``Pi[m]`` belong to m steps;
 ``Pi[m, i, j]`` is the probability of going from mode i to mode j.  Bit s of ``entry_sources[i, j]``
 says that state s is replaced when j is entered from i; ``entry_var`` is negative where it never is.
+``rear_end_gap``: APPROACHING in the ego's lane is reported as REAR_END up to this gap [m]; 0 never.
 """
 
 OBJECT_DTYPE = np.dtype(
@@ -124,6 +131,8 @@ WORK_DTYPE = np.dtype(
         ("Pi", np.float64, (_M, _M)),
         ("var", np.float64, (_N,)),
         ("lane_width", np.float64),
+        ("ground", np.float64),
+        ("angle", np.float64),
         ("source", np.int64, (_M,)),
     ],
     align=True,

@@ -50,7 +50,7 @@ def constrain_soft_(
     for c in range(bank.n_soft[j]):
         s = bank.soft_state[j, c]
         value = bank.soft_value[j, c] + reference(
-            bank.soft_kind[j, c], bank.soft_lanes[j, c], work.lane_width, x[s]
+            bank.soft_kind[j, c], bank.soft_lanes[j, c], work, x[s]
         )
         bad += 0.0 * update_state_(n, x, P, s, value, bank.soft_r[j, c], work.row)[1]
     return bad
@@ -65,6 +65,7 @@ def correct_(
     r: FloatArray,
     valid: Any,
     age: float,
+    angle: float,
     h: FloatArray,
     row: FloatArray,
 ) -> float:  # pragma: no cover - compiled
@@ -72,6 +73,7 @@ def correct_(
 
     Args:
         z, r: (4,) measured x, vx, y, vy and their variances.  valid: (4,) bool.
+        angle: of the axes in which z was measured, against those of ``x`` [rad].
         age: how long before the time of ``x`` the measurement was taken [s]; a position measured
             then is x - age vx + age^2/2 ax now.
         h: (n,) scratch.  row: (>= 2, n) scratch.
@@ -79,6 +81,9 @@ def correct_(
     Returns:
         Log density of z; NaN on a numeric failure.
     """
+    cos, sin = 1.0, 0.0
+    if angle != 0.0:
+        cos, sin = math.cos(angle), math.sin(angle)
     # one logarithm for all components
     square = 0.0
     product = 1.0
@@ -87,21 +92,29 @@ def correct_(
         if not valid[c]:
             continue
         count += 1
-        if age == 0.0:
+        if age == 0.0 and angle == 0.0:
             e, v = update_state_(n, x, P, c, z[c], r[c], row)
             square += e * e / v
             product *= v
             continue
         for s in range(n):
             h[s] = 0.0
-        h[c] = 1.0
-        a = AX + c // 2  # the axis' acceleration state, if the bank has one
-        if c == 0 or c == 2:
-            h[c + 1] = -age
-            if a < n:
-                h[a] = 0.5 * age * age
-        elif a < n:
-            h[a] = -age
+        for axis in range(2):
+            # share of this axis in the measured component
+            share = (cos if c < 2 else -sin) if axis == 0 else (sin if c < 2 else cos)
+            if share == 0.0:
+                continue
+            s = 2 * axis
+            a = AX + axis  # the axis' acceleration state, if the bank has one
+            if c == 0 or c == 2:
+                h[s] = share
+                h[s + 1] = -age * share
+                if a < n:
+                    h[a] = 0.5 * age * age * share
+            else:
+                h[s + 1] = share
+                if a < n:
+                    h[a] = -age * share
         e, v = update_row_(n, x, P, h, z[c], r[c], row)
         square += e * e / v
         product *= v
@@ -156,11 +169,11 @@ def update_mode_(
     for c in range(n_bounds):
         s = bank.bound_state[j, c]
         # The lane is that of the prior, for the posterior too.
-        base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work.lane_width, x[s])
+        base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work, x[s])
         work.lower[c] = base + bank.bound_lower[j, c]
         work.upper[c] = base + bank.bound_upper[j, c]
     prior = mass_(n, x, P, n_bounds, bank.bound_state[j], bank.var_floor, work)
-    log_l += correct_(n, x, P, z, r, valid, age, work.h, work.row)
+    log_l += correct_(n, x, P, z, r, valid, age, work.angle, work.h, work.row)
     if prior < LOG_MASS_FLOOR + 1.0:
         return LOG_FLOOR  # the constraint contradicts the past beyond what numbers can tell
     posterior = 0.0

@@ -196,6 +196,9 @@ class Estimator:
         tail = (
             np.tile(bank.measurement_variance, (n, 1)),
             np.ones((n, 4), np.bool_),
+            np.zeros(n),
+            layout.UNKNOWN_GROUND,
+            0.0,
             0.0,
             np.inf,
             np.zeros((n, bank.n_particles, N_COLUMNS)),

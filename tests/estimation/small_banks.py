@@ -90,6 +90,9 @@ class Runner:
         valid: Any = None,
         age: float = 0.0,
         gate: float = np.inf,
+        angle: float = 0.0,
+        ground: float = layout.UNKNOWN_GROUND,
+        lane_width: float = 0.0,
     ) -> np.ndarray[Any, Any]:
         """One scan; returns the status of each row."""
         n = len(slots)
@@ -99,7 +102,8 @@ class Runner:
             self.bank, self.objects, self.work, n, np.array(slots, np.int32),
             np.array(steps, np.int32), z, np.broadcast_to(r, z.shape).copy(),
             np.ones(z.shape, np.bool_) if valid is None else np.array(valid).reshape(n, 4),
-            age, gate, self.particles, self.spare, self.weights, self.noise, status,
+            np.full(n, angle), ground, lane_width, age, gate,
+            self.particles, self.spare, self.weights, self.noise, status,
         )  # fmt: skip
         return status
 

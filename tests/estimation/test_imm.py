@@ -490,10 +490,10 @@ def test_surprise_is_the_distance_from_what_is_possible() -> None:
     tau = 0.1 - 0.02
     e = z - [10.0 - 2.0 * tau, -2.0, 1.0 + 0.5 * tau, 0.5]
     d = e**2 / (np.array([0.1, 0.2, 0.3, 0.4]) + R + np.array([1.0, 16.0, 0.25, 4.0]))
-    value = imm.surprise(bank[0], obj[0], 10, z, R, valid, 0.02)
+    value = imm.surprise(bank[0], obj[0], 10, z, R, valid, 0.02, 0.0)
     assert value == pytest.approx(d.sum(), rel=1e-12)
     valid[0] = False
-    value = imm.surprise(bank[0], obj[0], 10, z, R, valid, 0.02)
+    value = imm.surprise(bank[0], obj[0], 10, z, R, valid, 0.02, 0.0)
     assert value == pytest.approx(d[1:].sum(), rel=1e-12)
 
 

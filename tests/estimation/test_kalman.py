@@ -144,6 +144,6 @@ def test_measurement_with_missing_components_and_age(
         f.H, f.R = H[valid], np.diag(r[valid])
         f.update(z[valid])
         expected = f.log_likelihood
-    log_l = correct_(n, p.x, p.P, z, r, valid, age, np.empty(n), p.work)
+    log_l = correct_(n, p.x, p.P, z, r, valid, age, 0.0, np.empty(n), p.work)
     p.check(f)
     assert log_l == pytest.approx(expected, rel=1e-9, abs=1e-9)
