@@ -19,12 +19,20 @@ from can_imm.estimation.layout import (
     GROUND,
     LANE,
     LOG_FLOOR,
+    NEGLIGIBLE_RISE,
     NEGLIGIBLE_WEIGHT,
     UNREACHABLE,
 )
-from can_imm.estimation.modes import keep_combined_, update_mode_, update_particles_
+from can_imm.estimation.modes import (
+    keep_combined_,
+    particle_limit,
+    update_mode_,
+    update_particles_,
+)
 from can_imm.estimation.noise import NoiseState
 from can_imm.types import FloatArray
+
+TWO_PI = 2.0 * math.pi
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -161,6 +169,47 @@ def surprise(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def order_modes_(bank: Any, work: Any) -> None:  # pragma: no cover - compiled
+    """Probabilities of the modes before the measurement into work.c, and into work.order the
+    likeliest first, for the others to be held against, and the particles last: they cost most."""
+    n_modes = bank.n_modes
+    for j in range(n_modes):
+        work.c[j] = 0.0
+    for i in range(n_modes):
+        if work.mu[i] > 0.0:
+            for j in range(n_modes):
+                work.c[j] += work.Pi[i, j] * work.mu[i]
+    first = -1
+    last = n_modes
+    for j in range(n_modes):
+        if not bank.is_particle[j] and (first < 0 or work.c[j] > work.c[first]):
+            first = j
+    k = 0
+    if first >= 0:
+        work.order[0] = first
+        k = 1
+    for j in range(n_modes):
+        if j == first:
+            continue
+        if bank.is_particle[j]:
+            last -= 1
+            work.order[last] = j
+        else:
+            work.order[k] = j
+            k += 1
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def peak_density(r: FloatArray, valid: Any) -> float:  # pragma: no cover - compiled
+    """Log density of the measurement noise at zero, which no mode's likelihood exceeds."""
+    product = 1.0
+    for c in range(4):
+        if valid[c]:
+            product *= TWO_PI * r[c]
+    return -0.5 * math.log(product)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def cycle_(
     n: int,
     bank: Any,
@@ -199,26 +248,32 @@ def cycle_(
     work.lane_width = obj.lane_width
     present_(bank, obj, work.mu)
     transitions_(n, bank, obj, work, m)
-    for j in range(n_modes):
-        c = 0.0
-        for i in range(n_modes):
-            work.w[i] = work.Pi[i, j] * work.mu[i]
-            c += work.w[i]
-        work.c[j] = c
-        for i in range(n_modes):
-            work.w[i] = work.w[i] / c if work.w[i] > NEGLIGIBLE_WEIGHT * c else 0.0
+    order_modes_(bank, work)
+    peak = peak_density(r, valid)
+    worth = math.log(bank.mu_floor * NEGLIGIBLE_RISE)  # -inf without a floor
+    best = -np.inf
+    for k in range(n_modes):
+        j = work.order[k]
+        c = work.c[j]
         log_l = LOG_FLOOR
         if c < UNREACHABLE:
             work.c[j] = 0.0
-            keep_combined_(n, obj, work.x[j], work.P[j])
-        elif bank.is_particle[j]:
-            log_l = update_particles_(
-                bank, obj, work, j, m, z, r, valid, age, particles, spare, weights, noise
-            )
-        else:
-            mix_(n, bank, obj, work, j, m)
-            predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
-            log_l = update_mode_(n, bank, work, j, z, r, valid, age)
+        elif math.log(c) + peak > best + worth:
+            for i in range(n_modes):
+                p = work.Pi[i, j] * work.mu[i]
+                work.w[i] = p / c if p > NEGLIGIBLE_WEIGHT * c else 0.0
+            if not bank.is_particle[j]:
+                mix_(n, bank, obj, work, j, m)
+                predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
+                log_l = update_mode_(n, bank, work, j, z, r, valid, age)
+                best = max(best, math.log(c) + log_l)
+            elif (
+                math.log(c) + peak + particle_limit(bank, obj, work, j, m, z, r, valid, age)
+                > best + worth
+            ):
+                log_l = update_particles_(
+                    bank, obj, work, j, m, z, r, valid, age, particles, spare, weights, noise
+                )
         if not log_l > LOG_FLOOR:
             # Also a numeric failure: what is left of its state must not reach the others.
             keep_combined_(n, obj, work.x[j], work.P[j])

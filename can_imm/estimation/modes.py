@@ -18,6 +18,7 @@ import numpy as np
 from can_imm.estimation.constraints import (
     LOG_MASS_FLOOR,
     interval_mass,
+    normal_probability,
     project_,
     truncate_,
 )
@@ -34,7 +35,7 @@ from can_imm.estimation.particles import (
     resample_,
     weigh_,
 )
-from can_imm.types import AX, FloatArray
+from can_imm.types import AX, VX, VY, FloatArray, Y
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -202,6 +203,60 @@ def keep_combined_(
         x[s] = obj.mean[s]
         for t in range(n):
             P[s, t] = obj.cov[s, t]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def particle_limit(
+    bank: Any,
+    obj: Any,
+    work: Any,
+    j: int,
+    m: int,
+    z: FloatArray,
+    r: FloatArray,
+    valid: Any,
+    age: float,
+) -> float:  # pragma: no cover - compiled
+    """Log of a bound on what the particles can say, over the peak density of the measurement.
+
+    Their speed is that of the profile, from f_min to the peak; their lateral position is normal
+    for each source, and has to lie in the window.  What x and vy say is not looked at.
+    ``work.w`` holds the mixing weights.  The measurement's axes must not be turned.
+    """
+    par = bank.particle
+    if work.angle != 0.0:
+        return 0.0
+    limit = 0.0
+    if valid[VX]:
+        v = r[VX] + par.std_profile**2
+        e = max(par.f_min - z[VX], z[VX] - par.peak_high, 0.0)
+        limit = -0.5 * (e * e / v + math.log(v / r[VX]))
+    tau = m * bank.step_s
+    q = par.q_vy * tau
+    share = 0.0
+    for i in range(bank.n_modes):
+        if work.w[i] == 0.0:
+            continue
+        if i == j:
+            share += work.w[i]  # nothing is known of the own particles but that they are inside
+            continue
+        # y and vy at the end of the step, and y at the measurement, which is y - age vy
+        vv = obj.P[i, VY, VY] + par.entry_vy_std**2
+        yy = obj.P[i, Y, Y] + tau * (2.0 * obj.P[i, Y, VY] + tau * (vv + 0.25 * q))
+        yv = obj.P[i, Y, VY] + tau * (vv + 0.5 * q)
+        vv += q
+        y = obj.x[i, Y] + tau * obj.x[i, VY]
+        p = 1.0
+        if valid[Y]:
+            s = yy - age * (2.0 * yv - age * vv) + r[Y]
+            gain = (yy - age * yv) / s
+            e = z[Y] - y + age * obj.x[i, VY]
+            y += gain * e
+            yy -= gain * gain * s
+            p = math.exp(-0.5 * e * e / s) * math.sqrt(r[Y] / s)
+        sd = math.sqrt(max(yy, bank.var_floor))
+        share += work.w[i] * p * normal_probability((par.y_low - y) / sd, (par.y_high - y) / sd)
+    return limit + math.log(share)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
