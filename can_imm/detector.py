@@ -10,7 +10,7 @@ import numpy as np
 from can_imm.estimation import imm, layout
 from can_imm.estimation.entry import entry_point
 from can_imm.estimation.noise import noise_state
-from can_imm.estimation.particles import N_COLUMNS
+from can_imm.estimation.particles import N_COLUMNS, N_SCRATCH
 from can_imm.manoeuvres import ModeBank
 from can_imm.reporting import extrapolate_all_, fill_reports_
 from can_imm.types import REPORT_DTYPE, CanImmError, FloatArray, IntArray, Scan
@@ -99,8 +99,8 @@ class Detector:
         self._noise = noise_state(np.random.default_rng(seed))
         self._objects = np.zeros(capacity, layout.OBJECT_DTYPE)
         self._work = np.zeros(1, layout.WORK_DTYPE)
-        self._particles: FloatArray = np.zeros((capacity, bank.n_particles, N_COLUMNS))
-        self._spare: FloatArray = np.zeros((bank.n_particles, N_COLUMNS))
+        self._particles: FloatArray = np.zeros((capacity, N_COLUMNS, bank.n_particles))
+        self._spare: FloatArray = np.zeros((N_SCRATCH, bank.n_particles))
         self._weights: FloatArray = np.zeros(bank.n_particles)
         # per slot
         self._id: IntArray = np.full(capacity, -1, np.int32)

@@ -235,8 +235,8 @@ def cycle_(
         z, r: (4,) measured x, vx, y, vy and their variances.  valid: (4,) bool.
         age: of the measurement [s].
         gate: z is an outlier if its `surprise` is larger; inf switches the gate off.
-        particles: (N, 7) the object's particles; N may be 0 in a bank without a particle mode.
-        spare: (N, 7) scratch.  weights: (N,) scratch.
+        particles: (7, N) the object's particles; N may be 0 in a bank without a particle mode.
+        spare: (10, N) scratch.  weights: (N,) scratch.
         noise: state of the random numbers, used by the particle mode only.
 
     Returns:
@@ -420,7 +420,7 @@ def process_scan_(
         ground: speed of the ground against the ego vehicle, or `UNKNOWN_GROUND` [m/s].
         lane_width: of the road [m]; 0 leaves it to each object.
         age, gate, spare, weights, noise: as for `cycle_`.
-        particles: (capacity, n_particles, 7).
+        particles: (capacity, 7, n_particles).
         status: (N,) int8, written: OK, OUTLIER or FAILED.
     """
     work[0].ground = ground

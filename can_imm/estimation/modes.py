@@ -31,6 +31,7 @@ from can_imm.estimation.particles import (
     cholesky4_,
     enter_,
     moments_,
+    moved_,
     propagate_,
     resample_,
     weigh_,
@@ -232,7 +233,6 @@ def particle_limit(
         e = max(par.f_min - z[VX], z[VX] - par.peak_high, 0.0)
         limit = -0.5 * (e * e / v + math.log(v / r[VX]))
     tau = m * bank.step_s
-    q = par.q_vy * tau
     share = 0.0
     for i in range(bank.n_modes):
         if work.w[i] == 0.0:
@@ -241,11 +241,8 @@ def particle_limit(
             share += work.w[i]  # nothing is known of the own particles but that they are inside
             continue
         # y and vy at the end of the step, and y at the measurement, which is y - age vy
-        vv = obj.P[i, VY, VY] + par.entry_vy_std**2
-        yy = obj.P[i, Y, Y] + tau * (2.0 * obj.P[i, Y, VY] + tau * (vv + 0.25 * q))
-        yv = obj.P[i, Y, VY] + tau * (vv + 0.5 * q)
-        vv += q
-        y = obj.x[i, Y] + tau * obj.x[i, VY]
+        moved_(obj.x[i], obj.P[i], tau, par, work.tx, work.tP)
+        y, yy, yv, vv = work.tx[1], work.tP[1, 1], work.tP[2, 1], work.tP[2, 2]
         p = 1.0
         if valid[Y]:
             s = yy - age * (2.0 * yv - age * vv) + r[Y]
@@ -282,33 +279,38 @@ def update_particles_(
     transition), not a soft overlap.
     """
     n_modes, n = bank.n_modes, bank.n_states
-    total = particles.shape[0]
+    total = particles.shape[1]
     x = work.x[j]
     P = work.P[j]
-    # systematic allocation of the particles to the sources
-    done = 0
-    cumulative = 0.0
+    tau = m * bank.step_s
+    # systematic allocation of the particles to the sources: the mode itself, then the others
+    last = j  # takes what rounding leaves over
+    for i in range(n_modes):
+        if i != j and work.w[i] > 0.0:
+            last = i
     words = load(noise)
     u, words = uniform(words)
     store_(noise, words)
+    cumulative = work.w[j]
+    done = min(int(cumulative * total + u), total) if last != j else total
+    if done > 0:
+        # they are equally weighted after resampling: take evenly spaced ones
+        spacing = total / done
+        for c in range(N_COLUMNS):
+            for k in range(done):
+                spare[c, k] = particles[c, int(k * spacing)]
+        propagate_(spare, spare[N_COLUMNS:], done, tau, bank.particle, noise)
     for i in range(n_modes):
-        cumulative += work.w[i]
-        upto = min(int(cumulative * total + u), total) if i < n_modes - 1 else total
-        count = upto - done
-        if count <= 0:
+        if i == j or work.w[i] == 0.0:
             continue
-        if i == j:
-            # own particles are equally weighted after resampling: take evenly spaced ones
-            for k in range(count):
-                a = (k * total) // count
-                for c in range(N_COLUMNS):
-                    spare[done + k, c] = particles[a, c]
-        else:
-            cholesky4_(obj.P[i], work.L)
-            enter_(spare, done, count, obj.x[i], work.L, bank.particle, noise)
-        done = upto
-    propagate_(spare, m * bank.step_s, bank.particle, noise)
-    log_l = weigh_(spare, weights, z, r, valid, age, bank.particle)
+        cumulative += work.w[i]
+        upto = min(int(cumulative * total + u), total) if i != last else total
+        if upto > done:
+            moved_(obj.x[i], obj.P[i], tau, bank.particle, work.tx, work.tP)
+            cholesky4_(work.tP, work.L)
+            enter_(spare, done, upto - done, work.tx, work.L, bank.particle, noise)
+            done = upto
+    log_l = weigh_(spare, weights, z, r, valid, age, work.angle, bank.particle)
     for s in range(n):
         for t in range(n):
             P[s, t] = 0.0

@@ -27,7 +27,7 @@ from can_imm.detector import Detector
 from can_imm.estimation import imm, layout
 from can_imm.estimation.entry import entry_point
 from can_imm.estimation.noise import noise_state
-from can_imm.estimation.particles import N_COLUMNS
+from can_imm.estimation.particles import N_COLUMNS, N_SCRATCH
 from can_imm.manoeuvres import PRESETS, ModeBank, bank_from_dict
 from can_imm.runtime.clock import FastClock
 from can_imm.runtime.feeds import LogFeed
@@ -201,8 +201,8 @@ class Estimator:
             0.0,
             0.0,
             np.inf,
-            np.zeros((n, bank.n_particles, N_COLUMNS)),
-            np.zeros((bank.n_particles, N_COLUMNS)),
+            np.zeros((n, N_COLUMNS, bank.n_particles)),
+            np.zeros((N_SCRATCH, bank.n_particles)),
             np.zeros(bank.n_particles),
             noise_state(np.random.default_rng(0)),
             np.zeros(n, np.int8),
