@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,9 @@ from can_imm.estimation.entry import entry_point
 from can_imm.estimation.noise import noise_state
 from can_imm.estimation.particles import N_COLUMNS, N_SCRATCH
 from can_imm.manoeuvres import ModeBank
+from can_imm.relations import MEMORY_DTYPE, relate_, shift_lanes_
 from can_imm.reporting import extrapolate_all_, fill_reports_
+from can_imm.road import RoadFrame
 from can_imm.types import REPORT_DTYPE, CanImmError, FloatArray, IntArray, Scan
 
 LARGEST = 1e6
@@ -114,7 +117,13 @@ class Detector:
         self._slot: IntArray = np.zeros(0, np.int32)
         self._steps: IntArray = np.zeros(0, np.int32)
         self._status = np.zeros(0, np.int8)
+        self._z: FloatArray = np.zeros((0, 4))
         self._r: FloatArray = np.zeros((0, 4))
+        self._angle: FloatArray = np.zeros(0)
+        # what lies between objects and between scans
+        self._memory = np.zeros(capacity, MEMORY_DTYPE)
+        self._road = None if bank.road is None else RoadFrame(bank.road)
+        self._ego_speed = np.nan
         self._last_t_ns = -1
         self._last_counter = -1
         self._warm_up()
@@ -130,13 +139,17 @@ class Detector:
             self._slot = np.zeros(n, np.int32)
             self._steps = np.zeros(n, np.int32)
             self._status = np.zeros(n, np.int8)
+            self._z = np.zeros((n, 4))
             self._r = np.zeros((n, 4))
+            self._angle = np.zeros(n)
 
     def _warm_up(self) -> None:
         """Compile, or load from the cache, every kernel that `step` and `predict` call."""
         scan = Scan(1)
         self._grow_rows(self.capacity)
         self._slot[0] = -1
+        relate_(self._id, self._memory, self.reports, 0)
+        shift_lanes_(self._memory, 0)
         arguments = self._arguments(scan, 1, 0.0)
         self._process = entry_point(imm.process_scan_, *arguments)
         self._process(*arguments)
@@ -166,14 +179,31 @@ class Detector:
         n = scan.n
         self._measured[:] = False
         self._assign(scan, now)
+        self._take_measurements(scan)
+        if self._road is not None:
+            self._road.move(scan)
+            self._road.localise_(scan, self._z, self._r)
+        self._process(*self._arguments(scan, n, (t_ns - scan.t_ns) * 1e-9))
+        self._settle(scan, now)
+        if self._road is not None:
+            moved = self._road.watch_(
+                self.bank, self._objects, scan, self._slot, self._status, self._age
+            )
+            if moved:
+                shift_lanes_(self._memory, moved)
+        self._bury(now)
+        return self._report(t_ns, now)
+
+    def _take_measurements(self, scan: Scan) -> None:
+        """Values, variances and axes of the scan, in buffers of our own."""
+        n = scan.n
+        self._z[:n] = scan.z[:n]
+        self._angle[:n] = scan.angle[:n]
         np.clip(scan.std[:n], 0.0, LARGEST, out=self._r[:n])
         np.square(self._r[:n], out=self._r[:n])
         if self.bank.measurement_variance is not None:
             self._r[:n] = self.bank.measurement_variance
-        self._process(*self._arguments(scan, n, (t_ns - scan.t_ns) * 1e-9))
-        self._settle(scan, now)
-        self._bury(now)
-        return self._report(t_ns, now)
+        self._ego_speed = scan.ego_speed
 
     def predict(self, t_ns: int) -> int:
         """Extrapolate every tracked object to the step at ``t_ns`` into `predicted`.
@@ -181,6 +211,13 @@ class Detector:
         Returns:
             The number of rows written, `n_tracked`.
         """
+        n = self._extrapolate(t_ns)
+        if self._road is not None:
+            self._road.globalise_(self.predicted, n)
+        return n
+
+    def _extrapolate(self, t_ns: int) -> int:
+        """Like `predict`, in the axes of the road."""
         return int(
             extrapolate_all_(
                 self._objects,
@@ -262,12 +299,12 @@ class Detector:
             n,
             self._slot,
             self._steps,
-            scan.z,
+            self._z,
             self._r,
             scan.valid,
-            scan.angle,
-            layout.UNKNOWN_GROUND,
-            0.0,
+            self._angle,
+            layout.UNKNOWN_GROUND if math.isnan(scan.ego_speed) else -scan.ego_speed,
+            0.0 if self._road is None else self._road.width,
             age,
             self._gate,
             self._particles,
@@ -331,8 +368,11 @@ class Detector:
         n: int = self._fill(*self._report_arguments(t_ns))
         coasting = self.reports["coasting"]
         if coasting[:n].any():
-            self.predict(now * self._step_ns)
+            self._extrapolate(now * self._step_ns)
             for k in np.flatnonzero(coasting[:n]):
                 self.reports[k] = self.predicted[k]
                 self.reports["t_ns"][k] = t_ns
+        if self._road is not None:
+            relate_(self._id, self._memory, self.reports, n)
+            self._road.globalise_(self.reports, n)
         return n

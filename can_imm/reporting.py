@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numba
 import numpy as np
 
+from can_imm.estimation.constraints import normal_mass
 from can_imm.estimation.imm import extrapolate_
+from can_imm.estimation.road import place
 from can_imm.types import FloatArray, Manoeuvre
 
 _LANE_CHANGE = int(Manoeuvre.LANE_CHANGE)
+_APPROACHING = int(Manoeuvre.APPROACHING)
+_REAR_END = int(Manoeuvre.REAR_END)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -20,7 +25,9 @@ def conclude_(
     """Fill one report from mode probabilities and the combined estimate.
 
     A manoeuvre's probability is the sum over its modes; the direction of a lane change is that of
-    its likelier modes; the lane is the nearer of the two.
+    its likelier modes; the lane is the nearest
+    one.  Where APPROACHING turns into REAR_END by the gap, its probability is shared out by how likely
+    the object is to be that near, and in the ego's lane.
 
     Args:
         bank: record of `layout.BANK_DTYPE`.  width: of the object's lanes [m].
@@ -32,6 +39,15 @@ def conclude_(
     for j in range(bank.n_modes):
         report.p[bank.manoeuvre[j]] += mu[j]
         turn += mu[j] * bank.direction[j]
+    if bank.rear_end_gap > 0.0:
+        sx = math.sqrt(cov[0, 0])
+        sy = math.sqrt(cov[2, 2])
+        near = math.exp(
+            normal_mass(-np.inf, (bank.rear_end_gap - mean[0]) / sx)
+            + normal_mass((-0.5 * width - mean[2]) / sy, (0.5 * width - mean[2]) / sy)
+        )
+        report.p[_REAR_END] += near * report.p[_APPROACHING]
+        report.p[_APPROACHING] *= 1.0 - near
     best = 1
     for i in range(2, report.p.shape[0]):
         if report.p[i] > report.p[best]:
@@ -53,6 +69,8 @@ def conclude_(
         if turn == 0.0:
             report.direction = 1 if mean[3] >= 0.0 else -1
     report.lane = 1 if mean[2] > 0.5 * width else 0
+    if bank.relative_lanes:
+        report.lane = min(max(math.floor(mean[2] / width + 0.5), -100), 100)
     for s in range(4):
         report.x[s] = mean[s]
         for t in range(4):
@@ -118,3 +136,19 @@ def extrapolate_all_(
         conclude_(bank[0], objects[s].lane_width, w.w, w.tx, w.tP, report)
         n += 1
     return n
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def globalise_(road: FloatArray, h: FloatArray, reports: Any, n: int, speed: float) -> None:
+    """States of the first n reports from the road's axes into the sensor's, in place.
+
+    Args:
+        road: (7,) state of `estimation.road`.  h: (7,) scratch.
+        speed: of the ego [m/s], NaN where unknown.
+    """
+    for k in range(n):
+        report = reports[k]
+        y, vy = place(road, h, report.x[0], report.x[1], speed)
+        report.x[2] += y
+        report.x[3] += vy
+        report.ego_speed = speed

@@ -64,11 +64,14 @@ class Scan:
         valid: (capacity, 4) which components were measured; the others' values mean nothing.
         new: (capacity,) the sensor says that this id names another object than in its last scan.
         existence: (capacity,) probability that the object exists; 1 from a sensor that gives none.
+        object_class: (capacity,) int8, 0 unknown, 1 car, 2 truck, 3 pedestrian, 4 motorcycle,
+            5 bicycle, 6 wide object.
+        size: (capacity, 2) length and width [m], NaN where the sensor gives none.
     """
 
     __slots__ = (
-        "angle", "counter", "ego_speed", "ego_yaw_rate", "existence", "ids", "incomplete", "n", "new",
-        "std", "t_ns", "valid", "z",
+        "angle", "counter", "ego_speed", "ego_yaw_rate", "existence", "ids", "incomplete", "n",
+        "new", "object_class", "size", "std", "t_ns", "valid", "z",
     )  # fmt: skip
 
     def __init__(self, capacity: int) -> None:
@@ -84,6 +87,8 @@ class Scan:
         self.valid: BoolArray = np.zeros((capacity, 4), np.bool_)
         self.new: BoolArray = np.zeros(capacity, np.bool_)
         self.existence: FloatArray = np.ones(capacity)
+        self.object_class: npt.NDArray[np.int8] = np.zeros(capacity, np.int8)
+        self.size: FloatArray = np.full((capacity, 2), np.nan)
 
     @property
     def capacity(self) -> int:
@@ -100,7 +105,9 @@ class Scan:
             n,
         )
         self.ego_speed, self.ego_yaw_rate = other.ego_speed, other.ego_yaw_rate
-        for name in ("ids", "angle", "z", "std", "valid", "new", "existence"):
+        for name in (
+            "ids", "angle", "z", "std", "valid", "new", "existence", "object_class", "size",
+        ):  # fmt: skip
             getattr(self, name)[:n] = getattr(other, name)[:n]
 
 
@@ -180,8 +187,9 @@ REPORT_DTYPE = np.dtype(
 which the object was seen; ``manoeuvre`` and ``second`` are values of `Manoeuvre`; ``direction`` of
 a lane change: +1 left, -1 right, 0 none;
 ``lane`` with two lanes 0 right, 1 left; otherwise 0 the ego's, +1 the next to the left;
-``flags`` bits `CUT_IN`, `CUT_OUT`, `OVERTAKING_ANOTHER`; ``duplicate_of`` object id of an older track
-of the same vehicle, -1 if there is none; ``ego_speed`` [m/s], NaN if unknown; ``coasting`` the object was missed in this scan; ``x``, ``cov`` mean and
+``flags`` bits `CUT_IN`, `CUT_OUT`, `OVERTAKING_ANOTHER`; ``duplicate_of`` object id of an older
+track of the same vehicle, -1 if there is none; ``ego_speed`` [m/s], NaN if unknown;
+``coasting`` the object was missed in this scan; ``x``, ``cov`` mean and
 covariance of (x, vx, y, vy); ``p`` probability by `Manoeuvre` value, summing to 1 (all 0 while
 UNKNOWN).
 """

@@ -72,10 +72,12 @@ BANK_DTYPE = np.dtype(
         ("entry_mean", np.float64, (_M, _N)),
         ("entry_var", np.float64, (_M, _N)),
         ("particle", PARTICLE_DTYPE),
+        ("relative_lanes", np.int64),
         ("n_modes", np.int64),
         ("n_states", np.int64),
         ("manoeuvre", np.int8, (_M,)),
         ("direction", np.int8, (_M,)),
+        ("off_lane", np.int8, (_M,)),
         ("is_particle", np.int8, (_M,)),
         ("is_projected", np.int8, (_M,)),
         ("n_soft", np.int8, (_M,)),
@@ -94,6 +96,7 @@ BANK_DTYPE = np.dtype(
 Tables are indexed by the number of elapsed steps: ``F[m]``, ``Q[m]``, ``Pi[m]`` belong to m steps;
 ``Pi[m, i, j]`` is the probability of going from mode i to mode j.  Bit s of ``entry_sources[i, j]``
 says that state s is replaced when j is entered from i; ``entry_var`` is negative where it never is.
+``off_lane``: what is in this mode says nothing of where the lanes are.
 ``rear_end_gap``: APPROACHING in the ego's lane is reported as REAR_END up to this gap [m]; 0 never.
 """
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from can_imm.estimation.layout import BANK_DTYPE, MAX_MODES, MAX_STEPS
 from can_imm.estimation.models import repeat, stationary
+from can_imm.estimation.road import PARAMETERS
 from can_imm.manoeuvres.constraints import Lanes, fill_bounds, fill_entry, fill_soft, read_lanes
 from can_imm.manoeuvres.motion import constant_speed, read_motion
 from can_imm.manoeuvres.particles import fill_particles
@@ -23,6 +24,7 @@ LARGEST = 1e6
 """No number of a preset is larger: nothing on a road is, and nothing can overflow."""
 
 _MANOEUVRES = {m.name: m for m in Manoeuvre if m is not Manoeuvre.UNKNOWN}
+_OFF_LANE = (Manoeuvre.STATIONARY, Manoeuvre.ONCOMING)
 _DIRECTIONS = {"left": +1, "right": -1, "none": 0}
 
 
@@ -40,6 +42,8 @@ class ModeBank:
         n_particles: of the particle mode, 0 without one.
         step_ns: step that the tables are made for [ns].
         lane_width: [m].
+        road: (19,) `estimation.road.PARAMETERS`, None for a bank whose lanes stand still in the
+            sensor's axes.
         measurement_variance: (4,) to be used instead of the sensor's own, or None.
     """
 
@@ -53,6 +57,7 @@ class ModeBank:
     step_ns: int
     lane_width: float
     measurement_variance: FloatArray | None
+    road: FloatArray | None = None
 
 
 def builtin_presets() -> list[str]:
@@ -109,6 +114,9 @@ def _bank(top: Table, step_ns: int, n_steps: int) -> ModeBank:
     variance = None
     if "measurement_variance" in top:
         variance = np.array(top.numbers("measurement_variance", 4, above=0.0))
+    road = _road(top.table("road"), float(record["lane_width"])) if "road" in top else None
+    record["relative_lanes"] = road is not None
+    record["rear_end_gap"] = top.number("rear_end_gap", 0.0, low=0.0)
     n_particles = fill_particles(record, top.table("particles")) if "particles" in top else 0
 
     for j, mode in enumerate(modes):
@@ -139,6 +147,7 @@ def _bank(top: Table, step_ns: int, n_steps: int) -> ModeBank:
         step_ns=step_ns,
         lane_width=float(record["lane_width"]),
         measurement_variance=variance,
+        road=road,
     )
 
 
@@ -166,6 +175,15 @@ def _fill_lanes(record: Any, table: Table) -> Lanes:
     return read_lanes(table)
 
 
+def _road(table: Table, width: float) -> FloatArray:
+    values = [width]
+    for name in PARAMETERS[1:]:
+        sign = {} if name == "offset" else {"above": 0.0}
+        values.append(table.number(name, **sign))
+    table.done()
+    return np.array(values)
+
+
 def _fill_spreads(record: Any, top: Table, n: int) -> None:
     """Floors, and how far an object is from what is expected of it."""
     record["mu_floor"] = top.number("probability_floor", 1e-6, low=0.0, high=0.01)
@@ -181,6 +199,7 @@ def _fill_mode(
     n, step_s = len(states), float(record["step_s"])
     record["manoeuvre"][j] = mode.choice("manoeuvre", _MANOEUVRES)
     record["direction"][j] = mode.choice("direction", _DIRECTIONS, "none")
+    record["off_lane"][j] = record["manoeuvre"][j] in _OFF_LANE
     record["is_particle"][j] = is_particle = _is_particle(mode, n_particles)
     record["is_projected"][j] = mode.flag("project", False)
     F, Q = constant_speed(n, step_s) if is_particle else read_motion(mode, states, step_s)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from can_imm.estimation.layout import FIXED, LANE, MAX_ROWS
+from can_imm.estimation.layout import FIXED, GROUND, LANE, MAX_ROWS
 from can_imm.tables import Table, show
 
 Lanes = Mapping[str, tuple[int, int]]
@@ -42,7 +42,7 @@ def fill_soft(record: Any, j: int, mode: Table, states: Sequence[str], lanes: La
         record["soft_state"][j, c] = s
         record["soft_kind"][j, c], record["soft_lanes"][j, c] = kind, span
         record["soft_r"][j, c] = row.number("r", above=0.0)
-        record["soft_value"][j, c] = row.number("value", 0.0 if kind == LANE else None)
+        record["soft_value"][j, c] = row.number("value", None if kind == FIXED else 0.0)
         row.done()
 
 
@@ -93,7 +93,11 @@ def _state(row: Table, states: Sequence[str]) -> int:
 
 
 def _lane(row: Table, state: str, lanes: Lanes) -> tuple[int, tuple[int, int]]:
-    """Whether the row counts from a lane centre, and of which lanes."""
+    """Whether the row counts from a lane centre, and of which lanes, or from the ground."""
+    if row.flag("ground", False):
+        if state != "vx" or "lane" in row:
+            raise row.error("'ground' is for vx, without a lane")
+        return GROUND, (0, 0)
     if "lane" not in row:
         return FIXED, (0, 0)
     lane = row.text("lane")

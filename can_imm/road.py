@@ -1,0 +1,86 @@
+"""The axes of the road: from the sensor's axes into them and back, scan by scan."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from can_imm.estimation import road
+from can_imm.reporting import globalise_
+from can_imm.types import FloatArray, Scan
+
+if TYPE_CHECKING:
+    from can_imm.manoeuvres import ModeBank
+
+LONGEST_S = 1.0
+"""After a longer silence [s] the ego has moved on unseen: the road is a new one."""
+
+
+class RoadFrame:
+    """Keeps `estimation.road`'s filter, and what belongs to the scan in hand.
+
+    In the road's axes y counts from the middle of the ego's lane at the same distance, so that lane k
+    lies at k times the width whatever the ego and the road do.
+
+    Args:
+        par: (19,) `estimation.road.PARAMETERS`.
+
+    Attributes:
+        x, P: (7,), (7, 7) state and covariance of the filter.
+    """
+
+    def __init__(self, par: FloatArray) -> None:
+        self._par = par
+        self.x, self.P = road.new_road(par)
+        self._t_ns = -1
+        self._dt = 0.1
+        self._speed = math.nan
+        self._h = np.zeros(road.N_ROAD)
+        self._warm_up()
+
+    @property
+    def width(self) -> float:
+        """Of the lanes [m]."""
+        return float(self.x[road.WIDTH])
+
+    def _warm_up(self) -> None:
+        """Compile, or load from the cache."""
+        x, P = self.x.copy(), self.P.copy()
+        scan = Scan(1)
+        road.predict_road_(x, P, self._par, 0.1, 20.0, 0.0)
+        road.localise_(x, P, self._par, 0, scan.z, scan.std, scan.valid, scan.angle, 20.0)
+        road.place(x, self._h, 0.0, 0.0, 20.0)
+
+    def move(self, scan: Scan) -> None:
+        """Move the ego on to the time of this scan."""
+        dt = (scan.t_ns - self._t_ns) * 1e-9
+        if self._t_ns < 0 or dt > LONGEST_S:
+            width, var = self.x[road.WIDTH], self.P[road.WIDTH, road.WIDTH]
+            self.x, self.P = road.new_road(self._par)
+            self.x[road.WIDTH], self.P[road.WIDTH, road.WIDTH] = width, var
+        else:
+            self._dt = dt
+            road.predict_road_(self.x, self.P, self._par, dt, scan.ego_speed, scan.ego_yaw_rate)
+        self._t_ns = scan.t_ns
+        self._speed = scan.ego_speed
+
+    def localise_(self, scan: Scan, z: FloatArray, r: FloatArray) -> None:
+        """Measurements z, r (N, 4) of the scan into the road's axes, in place."""
+        road.localise_(self.x, self.P, self._par, scan.n, z, r, scan.valid, scan.angle, self._speed)
+
+    def watch_(
+        self, bank: ModeBank, objects: Any, scan: Scan, slot: Any, status: Any, age: Any
+    ) -> int:
+        """Update the road by the traffic; see `estimation.road.watch_traffic_`."""
+        return int(
+            road.watch_traffic_(
+                self.x, self.P, self._par, bank.record, objects, scan.n, slot, status, age,
+                scan.z, np.square(scan.std), scan.valid, scan.angle, self._dt,
+            )
+        )  # fmt: skip
+
+    def globalise_(self, reports: np.ndarray[Any, np.dtype[np.void]], n: int) -> None:
+        """The first n reports from the road's axes into the sensor's, in place."""
+        globalise_(self.x, self._h, reports, n, self._speed)
