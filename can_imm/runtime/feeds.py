@@ -161,12 +161,15 @@ class LogFeed:
             time.sleep(remaining_s)
         mine = []
         frame: Frame | None = self._next
+        frames, replaced = self._frames, self._replaced
         while frame is not None and frame.t_ns <= t_ns:
-            if frame.id in self._replaced:
+            if frame.id in replaced:
                 self.n_replaced += 1
             else:
                 mine.append(frame)
-            frame = self._read()
+            frame = next(frames, None)
+            if frame is not None and (self._offset_ns or frame.t_ns < self._earliest_ns):
+                frame = self._in_order(frame)
         self._next = frame
         self._earliest_ns = t_ns + LATE_NS
         return mine
@@ -174,10 +177,8 @@ class LogFeed:
     def next_ns(self) -> int:
         return 0 if self._next is None else self._next.t_ns
 
-    def _read(self) -> Frame | None:
-        frame = next(self._frames, None)
-        if frame is None:
-            return None
+    def _in_order(self, frame: Frame) -> Frame:
+        """The frame with a time that does not run backwards."""
         t_ns = frame.t_ns + self._offset_ns
         if t_ns < self._earliest_ns - JUMP_NS:
             self._health.clock_jumps += 1

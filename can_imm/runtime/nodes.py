@@ -145,18 +145,16 @@ class DetectorNode:
             self._waiting.done(scan)
             self._seen_ns = t_ns
             reports = self.detector.reports[:n]
-            answers += self._encoder.encode(reports, t_ns)
+            answers += self._encoder.encode(reports, t_ns, self._channel)
             for listener in self._listeners:
                 listener(t_ns, reports)
         if self._every_step and n == 0:
             predicted = self.detector.predicted[: self.detector.predict(t_ns)]
-            answers += self._encoder.estimates(predicted, t_ns)
+            answers += self._encoder.estimates(predicted, t_ns, self._channel)
         if self._status_ns is None or t_ns >= self._status_ns + self._encoder.status_period_ns:
             self._status_ns = t_ns
-            answers.append(self._encoder.status(t_ns, self._status(t_ns)))
-        if self._channel is not None:
-            channel = self._channel
-            answers = [Frame(t_ns, frame.id, frame.data, channel) for frame in answers]
+            status = self._encoder.status(t_ns, self._status(t_ns))
+            answers.append(status._replace(channel=self._channel))
         return answers
 
     def farewell(self, t_ns: int) -> list[Frame]:
