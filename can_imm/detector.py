@@ -208,6 +208,10 @@ class Detector:
         self._bury(now)
         return self._report(t_ns, now)
 
+    def understudy(self) -> Detector:
+        """A small detector like this one, for `runtime.nodes.DetectorNode.rehearse`."""
+        return Detector(self.bank, capacity=2)
+
     def predict(self, t_ns: int) -> int:
         """Extrapolate every tracked object to the step at ``t_ns`` into `predicted`.
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from can_imm.bus.frame import Frame
@@ -24,11 +24,30 @@ GUARD_NS = 2_000_000
 """How long after ``t_k`` [ns] a live step waits for frames that are still on their way."""
 
 
+REHEARSE_S = 600e-6
+"""So long before a live step with frames [s] it is rehearsed: what a step needs is in none of the
+processor's caches after some milliseconds of other work."""
+
+AWAKE_S = 150e-6
+"""So long before such a step [s] the loop stops sleeping, for waking up takes that time."""
+
+Rehearsal = Callable[[int, list[Frame]], None]
+
+
+def _nothing(t_ns: int, frames: list[Frame]) -> None:
+    pass
+
+
 class Feed(Protocol):
-    """Frames for a loop, step by step."""
+    """Frames for a loop, step by step.
+
+    ``rehearse``, set by the loop, is called before the first step, and shortly before a live step
+    that has frames, with these.
+    """
 
     clock: Clock
     guard_ns: int
+    rehearse: Rehearsal
 
     def start_ns(self, step_ns: int) -> int:
         """Return the time of the first step [ns], a multiple of ``step_ns``; called once."""
@@ -66,6 +85,7 @@ class BusFeed:
         self, source: FrameSource, clock: Clock, health: Health, guard_ns: int = GUARD_NS
     ) -> None:
         self.clock = clock
+        self.rehearse: Rehearsal = _nothing
         self._source = source
         self._health = health
         self.guard_ns = guard_ns
@@ -75,14 +95,25 @@ class BusFeed:
         self._foreign = False
 
     def start_ns(self, step_ns: int) -> int:
+        self.rehearse(0, [])
         self._done_ns = self.clock.now_ns() // step_ns * step_ns
         return self._done_ns
 
     def collect(self, t_ns: int) -> list[Frame]:
         due_ns = t_ns + self.guard_ns
+        rehearsed = False
         while True:
-            remaining_s = self.clock.remaining_s(due_ns)
-            frame = self._source.recv(max(remaining_s, 0.0))
+            remaining_s = timeout_s = self.clock.remaining_s(due_ns)
+            if self._pending and self._pending[0].t_ns <= t_ns:
+                if rehearsed:
+                    timeout_s -= AWAKE_S
+                elif remaining_s > REHEARSE_S:
+                    timeout_s -= REHEARSE_S
+                else:
+                    rehearsed = True
+                    self.rehearse(t_ns, list(self._pending))
+                    continue
+            frame = self._source.recv(max(timeout_s, 0.0))
             if frame is None:
                 if remaining_s <= 0:
                     break
@@ -141,6 +172,7 @@ class LogFeed:
         replaced: frozenset[int] = frozenset(),
     ) -> None:
         self.clock = clock
+        self.rehearse: Rehearsal = _nothing
         self.guard_ns = 0
         self.n_replaced = 0
         self._frames = iter(frames)
@@ -195,6 +227,7 @@ class IdleFeed:
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
+        self.rehearse: Rehearsal = _nothing
         self.guard_ns = 0
 
     def start_ns(self, step_ns: int) -> int:

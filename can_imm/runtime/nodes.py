@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy.typing as npt
@@ -23,6 +24,9 @@ SENSOR_TIMEOUT_NS = 1_000_000_000
 
 MAX_WAITING = 8
 """Scans that may wait for their step when several come at once."""
+
+REHEARSED = 4
+"""So many frames of a step are rehearsed."""
 
 S = TypeVar("S", Scan, DetectionScan)
 S_contra = TypeVar("S_contra", contravariant=True)
@@ -120,6 +124,7 @@ class DetectorNode:
         self._encoder = encoder
         self._health = health
         self._listeners = listeners
+        self._understudy: DetectorNode | None = None
         self._waiting = Waiting([Scan(capacity) for _ in range(MAX_WAITING)])
         # answers go where the sensor's frames came from
         self._channel: str | None = None
@@ -156,6 +161,15 @@ class DetectorNode:
             status = self._encoder.status(t_ns, self._status(t_ns))
             answers.append(status._replace(channel=self._channel))
         return answers
+
+    def rehearse(self, t_ns: int, frames: list[Frame]) -> None:
+        """Do a step on copies of everything and forget it: shortly before the real one that
+        fetches code and tables into the processor's caches.  The first call makes the copies."""
+        if self._understudy is None:
+            self._understudy = DetectorNode(
+                deepcopy(self.decoder), self.detector.understudy(), ManoeuvreEncoder(), Health()
+            )
+        self._understudy.step(t_ns, frames[:REHEARSED])
 
     def farewell(self, t_ns: int) -> list[Frame]:
         """Return the last frame of a detector that ends: DetectorStatus, state Stopping."""
