@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -54,6 +54,37 @@ class DetectorCounts:
     reused_ids: int = 0
 
 
+class History(Protocol):
+    """Who writes down what the detector thinks of its tracks; see `smoothing`."""
+
+    def scan(
+        self,
+        now: int,
+        objects: Any,
+        ids: IntArray,
+        measured: BoolArray,
+        reports: np.ndarray[Any, np.dtype[np.void]],
+        road: FloatArray | None,
+        moved: int,
+        ego_speed: float,
+    ) -> None:
+        """A scan was used; all arrays are the detector's own and change with the next one.
+
+        Args:
+            now: number of the step.
+            objects: (capacity,) of `layout.OBJECT_DTYPE`.
+            ids: (capacity,) object id of each slot, -1 for a free one.
+            measured: (capacity,) the slot was updated by this scan.
+            reports: (n,) of the slots in use, in their order, in the road's axes and unrelated.
+            road: (7,) state of `estimation.road`, None without a road.
+            moved: lanes that the ego has moved to the left since the last scan.
+            ego_speed: [m/s], NaN where unknown.
+        """
+
+    def end(self, slot: int) -> None:
+        """The track in this slot ended; another one may begin there."""
+
+
 class Detector:
     """Runs the constrained IMM for every object; one call per step of the loop.
 
@@ -65,6 +96,7 @@ class Detector:
         predicted: (capacity,) of `REPORT_DTYPE`: `predict` writes the first `n_tracked` rows.
         counts: `DetectorCounts`.
         n_tracked: number of objects tracked now.
+        history: is told of every scan and of every track's end; None: nobody is.
 
     Args:
         bank: mode bank; its step is the loop's.
@@ -91,6 +123,7 @@ class Detector:
         self.bank = bank
         self.capacity = capacity
         self.counts = DetectorCounts()
+        self.history: History | None = None
         self.reports: np.ndarray[Any, np.dtype[np.void]] = np.zeros(capacity, REPORT_DTYPE)
         self.predicted: np.ndarray[Any, np.dtype[np.void]] = np.zeros(capacity, REPORT_DTYPE)
         self._step_ns = bank.step_ns
@@ -109,8 +142,10 @@ class Detector:
         self._age: IntArray = np.zeros(capacity, np.int32)
         self._outliers: IntArray = np.zeros(capacity, np.int32)
         self._measured = np.zeros(capacity, np.bool_)
-        self._free: IntArray = np.arange(capacity - 1, -1, -1, np.int32)
-        self._n_free = np.array([capacity])
+        # the free slots, and those set free in a step: by an id's reuse, a failure and by coasting
+        self._free: IntArray = np.zeros(4 * capacity, np.int32)
+        self._free[:capacity] = range(capacity - 1, -1, -1)
+        self._n_free = np.array([capacity, 0])
         self._tally = np.zeros(len(TALLY), np.int64)
         self._next_burial = 0
         variance = bank.measurement_variance
@@ -135,6 +170,11 @@ class Detector:
     def n_tracked(self) -> int:
         """Number of objects tracked now."""
         return self.capacity - int(self._n_free[0])
+
+    @property
+    def road(self) -> RoadFrame | None:
+        """The axes of the road, None with a bank that has none."""
+        return self._road
 
     def _grow_rows(self, n: int) -> None:
         """Room for scans of up to n rows; happens once, for the first scan of a decoder."""
@@ -199,6 +239,7 @@ class Detector:
             (t_ns - scan.t_ns) * 1e-9,
         )
         self._settle(*self._settle_arguments(n, now))
+        moved = 0
         if self._road is not None:
             moved = self._road.watch_(
                 self.bank, self._objects, scan, self._slot, self._status, self._age
@@ -206,7 +247,7 @@ class Detector:
             if moved:
                 shift_lanes_(self._memory, moved)
         self._bury(now)
-        return self._report(t_ns, now)
+        return self._report(t_ns, now, moved)
 
     def understudy(self) -> Detector:
         """A small detector like this one, for `runtime.nodes.DetectorNode.rehearse`."""
@@ -307,6 +348,10 @@ class Detector:
             if number:
                 setattr(self.counts, name, getattr(self.counts, name) + number)
         self._tally[:] = 0
+        if self.history is not None:
+            for slot in self._free[self.capacity :][: self._n_free[1]].tolist():
+                self.history.end(slot)
+        self._n_free[1] = 0
 
     def _report_arguments(self, t_ns: int) -> tuple[Any, ...]:
         """Of `fill_reports_`."""
@@ -320,7 +365,7 @@ class Detector:
             self.reports,
         )
 
-    def _report(self, t_ns: int, now: int) -> int:
+    def _report(self, t_ns: int, now: int, moved: int) -> int:
         """Reports of all tracks; coasting ones are extrapolated."""
         n: int = self._fill(*self._report_arguments(t_ns))
         coasting = self.reports["coasting"]
@@ -329,6 +374,11 @@ class Detector:
             for k in np.flatnonzero(coasting[:n]):
                 self.reports[k] = self.predicted[k]
                 self.reports["t_ns"][k] = t_ns
+        if self.history is not None:
+            self.history.scan(
+                now, self._objects, self._id, self._measured, self.reports[:n],
+                None if self._road is None else self._road.x, moved, self._ego_speed,
+            )  # fmt: skip
         if self._road is not None:
             relate_(self._id, self._memory, self.reports, n)
             self._road.globalise_(self.reports, n)

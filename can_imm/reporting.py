@@ -143,7 +143,7 @@ def globalise_(road: FloatArray, h: FloatArray, reports: Any, n: int, speed: flo
     """States of the first n reports from the road's axes into the sensor's, in place.
 
     Args:
-        road: (7,) state of `estimation.road`.  h: (7,) scratch.
+        road: (31,) state of `estimation.road`.  h: (8,) scratch.
         speed: of the ego [m/s], NaN where unknown.
     """
     for k in range(n):

@@ -25,19 +25,21 @@ class RoadFrame:
     lies at k times the width whatever the ego and the road do.
 
     Args:
-        par: (19,) `estimation.road.PARAMETERS`.
+        par: `estimation.road.PARAMETERS`.
 
     Attributes:
-        x, P: (7,), (7, 7) state and covariance of the filter.
+        x, P: (31,), (31, 31) state and covariance of the filter.
     """
 
     def __init__(self, par: FloatArray) -> None:
         self._par = par
+        self._guide_slot = np.full(road.N_GUIDES, road.FREE, np.int32)
+        self._guide_unseen = np.zeros(road.N_GUIDES)
         self.x, self.P = road.new_road(par)
         self._t_ns = -1
         self._dt = 0.1
         self._speed = math.nan
-        self._h = np.zeros(road.N_ROAD)
+        self._h = np.zeros(road.N_ROAD + 1)
         self._warm_up()
 
     @property
@@ -51,6 +53,7 @@ class RoadFrame:
         scan = Scan(1)
         road.predict_road_(x, P, self._par, 0.1, 20.0, 0.0)
         road.localise_(x, P, self._par, 0, scan.z, scan.std, scan.valid, scan.angle, 20.0)
+        road.turn_with_road_(x, P, self._par, 20.0, 0.0, 1.0)
         road.place(x, self._h, 0.0, 0.0, 20.0)
 
     def move(self, scan: Scan) -> None:
@@ -60,6 +63,10 @@ class RoadFrame:
             width, var = self.x[road.WIDTH], self.P[road.WIDTH, road.WIDTH]
             self.x, self.P = road.new_road(self._par)
             self.x[road.WIDTH], self.P[road.WIDTH, road.WIDTH] = width, var
+            self._guide_slot[:] = road.FREE
+            road.turn_with_road_(
+                self.x, self.P, self._par, scan.ego_speed, scan.ego_yaw_rate, 1.0
+            )
         else:
             self._dt = dt
             road.predict_road_(self.x, self.P, self._par, dt, scan.ego_speed, scan.ego_yaw_rate)
@@ -76,7 +83,8 @@ class RoadFrame:
         """Update the road by the traffic; see `estimation.road.watch_traffic_`."""
         return int(
             road.watch_traffic_(
-                self.x, self.P, self._par, bank.record, objects, scan.n, slot, status, age,
+                self.x, self.P, self._par, self._guide_slot, self._guide_unseen,
+                bank.record, objects, scan.n, slot, status, age,
                 scan.z, np.square(scan.std), scan.valid, scan.angle, self._dt,
             )
         )  # fmt: skip

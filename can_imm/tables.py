@@ -80,6 +80,10 @@ class Table:
         """The keys that have not been taken yet; they may be taken meanwhile."""
         return iter(list(self._data))
 
+    def is_text(self, key: str) -> bool:
+        """Whether the key is there and its value a string."""
+        return isinstance(self._data.get(key), str)
+
     def error(self, text: str) -> CanImmError:
         """The refusal of this table for the reason ``text``, to be raised."""
         return _refusal(self.file, f"{self._place}: {text}" if self._place else text)

@@ -2,66 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
+from can_imm.bus.codec import EMPTY, USABLE
+from can_imm.bus.counts import DecodeCounts
+from can_imm.bus.ego import EGO, EgoReader
 from can_imm.bus.frame import ERROR, EXTENDED, FD, REMOTE, Frame
-from can_imm.bus.layout import HEADER, CompiledMessage, Layout
-from can_imm.bus.profile import Profile
+from can_imm.bus.layout import CompiledMessage, Layout
+from can_imm.bus.measurement import ObjectList
+from can_imm.bus.profile_parts import Profile
 from can_imm.types import Scan
+
+__all__ = ["DecodeCounts", "ScanDecoder"]
 
 _UNSUITABLE = EXTENDED | FD | REMOTE | ERROR
 
 RESYNC_PERIODS = 10
 """After a silence of so many scan periods a sender may have started anew: any counter will do."""
 
+FORGET_SCANS = 3
+"""A message that did not come in so many scans is not waited for any more."""
 
-@dataclass
-class DecodeCounts:
-    """What became of the frames.
-
-    Every frame is counted in ``frames`` and in exactly one of ``unknown`` (an id that is not the
-    sensor's), ``bad_kind`` (our id, but an extended, FD, remote or error frame), ``bad_length``,
-    ``bad_crc`` (in profile 1 the invalid counter 15, too), ``bad_counter`` (a repeated frame),
-    ``out_of_range``, ``stray`` (an object without a scan to belong to), ``duplicates`` (an object
-    twice in a scan), ``overflow`` (more objects than there is room for), ``empty`` (right, but
-    without an object) and ``used``. Beside that: ``checksums_ok`` frames with a right checksum,
-    ``lost`` frames missing by their counters, ``not_available`` single values that the sensor did
-    not have, ``scans`` finished, ``incomplete_scans`` of these with an announced object missing or
-    rejected, ``lost_scans`` missing by their counter.
-    """
-
-    frames: int = 0
-    unknown: int = 0
-    bad_kind: int = 0
-    bad_length: int = 0
-    bad_crc: int = 0
-    bad_counter: int = 0
-    out_of_range: int = 0
-    stray: int = 0
-    duplicates: int = 0
-    overflow: int = 0
-    empty: int = 0
-    used: int = 0
-    checksums_ok: int = 0
-    lost: int = 0
-    not_available: int = 0
-    scans: int = 0
-    incomplete_scans: int = 0
-    lost_scans: int = 0
-
-    @property
-    def rejected(self) -> int:
-        """Frames of the sensor that failed a check."""
-        return (
-            self.bad_kind
-            + self.bad_length
-            + self.bad_crc
-            + self.bad_counter
-            + self.out_of_range
-            + self.stray
-            + self.duplicates
-            + self.overflow
-        )
+NO_OBJECT = -1
+"""Number of an object of which a frame came, but not one to be used."""
 
 
 class ScanDecoder:
@@ -72,35 +35,48 @@ class ScanDecoder:
     that is not available is left out of the validity mask. Bad frames are counted in ``counts`` and
     survived.
 
+    Messages that a sensor may send of each object besides the first are waited for if it sent them
+    in its last scans. The first sensor that is heard is the one that counts, if the profile allows
+    several and names none.
+
     Attributes:
         ids: the frame ids it listens to.
         counts: `DecodeCounts`.
+        sensor: number of the sensor that counts, None as long as none was heard.
     """
 
     def __init__(self, profile: Profile, capacity: int = 64) -> None:
         self.counts = DecodeCounts()
-        self._layout = Layout(profile)
-        self._messages = self._layout.messages
+        self._layout = layout = Layout(profile)
+        self._ego = EgoReader(profile)
+        self._messages: dict[int, CompiledMessage] = {}
+        for ids in layout.messages.values():
+            self._messages.update(ids)
+        self._of_others: frozenset[int] = frozenset()
+        self.sensor: int | None = None
+        if len(profile.sensors.possible) == 1:
+            self._choose(profile.sensors.possible[0])
+        else:
+            self._messages.update(self._ego.messages)
         self.ids = frozenset(self._messages)
         self._period_ns, self._timeout_ns = profile.period_ns, profile.timeout_ns
         self._latency_ns = profile.latency_ns
         self._resync_ns = RESYNC_PERIODS * profile.period_ns
 
+        self._objects = ObjectList(profile, layout, capacity)
         self._scan = Scan(capacity)
-        for state, part in enumerate(profile.state):
-            if part is not None:
-                self._scan.std[:, state] = part.std
-        self._mask = tuple(part is not None for part in profile.state)
+        self._objects.prepare(self._scan)
 
         self._open = False
         self._start_ns = self._deadline_ns = 0
-        self._counter = self._expected = self._arrived = 0
+        self._counter = self._expected = self._arrived = self._awaited = 0
         self._damaged = False
-        self._seen: set[int] = set()
-        self._ids: list[int] = []
-        self._new: list[bool] = []
-        self._z: list[list[float]] = []
-        self._valid: list[tuple[bool, ...]] = []
+        self._numbers: dict[int, int] = {}
+        self._seen: set[tuple[int, int]] = set()
+        # of the messages that may come of each object: how many have in this scan, and for how
+        # many scans none has; at first they are waited for once
+        self._came = [0] * layout.also
+        self._silent = [FORGET_SCANS - 1] * layout.also
         # of the scan before the open one
         self._ended_counter, self._ended_ns = -1, 0
 
@@ -113,42 +89,68 @@ class ScanDecoder:
         counts.frames += 1
         message = self._messages.get(frame.id)
         if message is None:
-            counts.unknown += 1
+            if frame.id in self._of_others:
+                counts.other_sensor += 1
+            else:
+                counts.unknown += 1
             return None
         t_ns, data = frame.t_ns, frame.data
         if not self._passes(message, frame):
             return None
-        finished = self.flush(t_ns)
-        raws = message.read(data)
-        if message.slot == HEADER:
-            finished = self._take_header(t_ns, raws) or finished
-        elif not self._layout.slots:
-            if not self._open:
-                counts.stray += 1
-                return finished
-            self._take_object(raws[0], raws)
+        slot = message.slot
+        if message.take is None:
+            assert message.read is not None
+            raws = message.read(data[: message.length])
+            if slot == EGO:
+                self._ego.take(frame.id, t_ns, raws)
+                counts.ego += 1
+                return None
+            finished = self.flush(t_ns)
+            finished = self._take_header(t_ns, message.sensor, raws) or finished
         else:
-            if self._is_stale(t_ns, raws[0]):
+            finished = self.flush(t_ns)
+            row = message.take(data[: message.length])
+            if self._layout.slots:
+                if self._is_stale(t_ns, row[1]):
+                    counts.stray += 1
+                    return finished
+                if self._open and row[1] != self._counter:
+                    finished = self._finish()
+                if not self._open:
+                    self._begin(t_ns, row[1], self._layout.slots)
+                if slot in self._numbers:
+                    counts.duplicates += 1
+                    return finished
+                self._take_object(slot, row)
+            elif not self._open:
+                counts.stray += 1
+                if slot:  # the sensor sends such messages, so the next scan waits for them
+                    self._silent[slot - 1] = 0
+                return finished
+            elif slot:
+                self._complete_object(slot, row)
+            elif self._arrived == self._expected:
                 counts.stray += 1
                 return finished
-            if self._open and raws[0] != self._counter:
-                finished = self._finish()
-            if not self._open:
-                self._begin(t_ns, raws[0], self._layout.slots)
-            if message.slot in self._seen:
-                counts.duplicates += 1
-                return finished
-            self._seen.add(message.slot)
-            self._take_object(message.slot, raws)
-        if self._open and self._arrived == self._expected and finished is None:
+            else:
+                self._take_object(row[1], row)
+        if self._open and not self._awaited and finished is None:
             finished = self._finish()
         return finished
 
     def flush(self, t_ns: int) -> Scan | None:
         """Give up a scan that is overdue at ``t_ns`` [ns]; call it in every step."""
-        if self._open and (self._arrived == self._expected or t_ns > self._deadline_ns):
+        if self._open and (not self._awaited or t_ns > self._deadline_ns):
             return self._finish()
         return None
+
+    def _choose(self, sensor: int) -> None:
+        """From now on this sensor's frames count, and only these."""
+        self.sensor = sensor
+        of_all = self._layout.messages
+        self._messages = {**self._ego.of_sensor(sensor), **of_all[sensor]}
+        others = frozenset(frame_id for ids in of_all.values() for frame_id in ids)
+        self._of_others = others - frozenset(self._messages)
 
     def _passes(self, message: CompiledMessage, frame: Frame) -> bool:
         """Kind, length, checksum and counter; counts what fails."""
@@ -157,8 +159,11 @@ class ScanDecoder:
             counts.bad_kind += 1
             return False
         data = frame.data
-        if len(data) != message.length:
-            counts.bad_length += 1
+        if not message.length <= len(data) <= message.longest:
+            if message.slot == EGO:
+                counts.unknown += 1  # another message that happens to have the id
+            else:
+                counts.bad_length += 1
             return False
         guard = message.guard
         if guard is None:
@@ -167,6 +172,8 @@ class ScanDecoder:
             counts.bad_crc += 1
             return False
         counts.checksums_ok += 1
+        if not guard.modulus:
+            return True
         counter = guard.counter(data)
         last = message.last_counter
         if last >= 0 and abs(frame.t_ns - message.last_ns) <= self._resync_ns:
@@ -186,59 +193,68 @@ class ScanDecoder:
             and t_ns - self._ended_ns < self._period_ns
         )
 
-    def _take_header(self, t_ns: int, raws: tuple[int, ...]) -> Scan | None:
+    def _take_header(self, t_ns: int, sensor: int, raws: tuple[int, ...]) -> Scan | None:
         finished = self._finish() if self._open else None
         count, (low, high) = raws[0], self._layout.count_range
         if not low <= count <= high:
             self.counts.out_of_range += 1
             return finished
+        if self.sensor is None:
+            self._choose(sensor)
         self.counts.used += 1
         self._begin(t_ns, raws[1], count)
         return finished
 
-    def _take_object(self, key: int, raws: tuple[int, ...]) -> None:
-        """One object frame of the open scan; all of it, or nothing but a count."""
+    def _take_object(self, key: int, row: tuple[Any, ...]) -> None:
+        """The first frame of an object of the open scan; all of it, or nothing but a count."""
         counts = self.counts
         self._arrived += 1
-        layout = self._layout
-        for index, holds in layout.conditions:
-            if not holds(raws[index]):
+        self._awaited -= 1
+        numbers = self._numbers
+        if row[0] != USABLE:
+            numbers.setdefault(key, NO_OBJECT)
+            if row[0] == EMPTY:
                 counts.empty += 1
-                return
-        values = [0.0, 0.0, 0.0, 0.0]
-        missing = []
-        for index, state, scale, offset, low, high, absent, sign, shift in layout.components:
-            raw = raws[index]
-            if raw == absent:
-                missing.append(state)
-            elif low <= raw <= high:
-                values[state] = (raw * scale + offset) * sign + shift
             else:
                 self._reject("out_of_range")
-                return
-        if not layout.slots:
-            if not layout.key_range[0] <= key <= layout.key_range[1]:
-                self._reject("out_of_range")
-                return
-            if key in self._seen:
-                self._reject("duplicates")
-                return
-            self._seen.add(key)
-        counts.not_available += len(missing)
-        if len(missing) == len(layout.components):
-            counts.empty += 1
             return
-        if len(self._ids) == self._scan.capacity:
+        if numbers.get(key, NO_OBJECT) != NO_OBJECT:
+            self._reject("duplicates")
+            return
+        counts.not_available += row[3]
+        objects = self._objects
+        number = len(objects.ids)
+        if number == self._scan.capacity:
+            numbers[key] = NO_OBJECT
             self._reject("overflow")
             return
-        mask = self._mask
-        if missing:
-            mask = tuple(there and state not in missing for state, there in enumerate(mask))
+        numbers[key] = number
         counts.used += 1
-        self._ids.append(key)
-        self._new.append(layout.new is not None and raws[layout.new] != 0)
-        self._z.append(values)
-        self._valid.append(mask)
+        objects.add(key, row)
+
+    def _complete_object(self, slot: int, row: tuple[Any, ...]) -> None:
+        """A further frame of an object of the open scan."""
+        counts, key = self.counts, row[1]
+        number = self._numbers.get(key)
+        if number is None:
+            counts.stray += 1
+            return
+        if (slot, key) in self._seen:
+            counts.duplicates += 1
+            return
+        self._seen.add((slot, key))
+        which = slot - 1
+        if self._silent[which] >= FORGET_SCANS and not self._came[which]:
+            self._awaited += self._expected
+        self._came[which] += 1
+        self._awaited -= 1
+        if row[0] != USABLE or number == NO_OBJECT:
+            counts.empty += 1
+            if number != NO_OBJECT:
+                self._objects.drop(number)
+            return
+        counts.used += 1
+        self._objects.complete(number, slot, row)
 
     def _reject(self, reason: str) -> None:
         setattr(self.counts, reason, getattr(self.counts, reason) + 1)
@@ -253,21 +269,25 @@ class ScanDecoder:
         self._open = True
         self._start_ns, self._deadline_ns = t_ns, t_ns + self._timeout_ns
         self._counter, self._expected, self._arrived = counter, expected, 0
+        self._awaited = expected * (1 + sum(scans < FORGET_SCANS for scans in self._silent))
+        self._came = [0] * len(self._came)
         self._damaged = False
-        self._seen, self._ids, self._new, self._z, self._valid = set(), [], [], [], []
+        self._numbers, self._seen = {}, set()
+        self._objects.clear()
 
     def _finish(self) -> Scan:
         """Close the open scan and write it to the buffer."""
-        scan, n = self._scan, len(self._ids)
+        scan = self._scan
         scan.t_ns = self._start_ns - self._latency_ns
         scan.counter = self._counter
         scan.incomplete = self._damaged or self._arrived < self._expected
-        scan.n = n
-        if n:
-            scan.ids[:n] = self._ids
-            scan.new[:n] = self._new
-            scan.z[:n] = self._z
-            scan.valid[:n] = self._valid
+        scan.ego_speed, scan.ego_yaw_rate = self._ego.at(self._start_ns)
+        self._objects.write(scan)
+        if self._expected:
+            self._silent = [
+                0 if came else scans + 1
+                for came, scans in zip(self._came, self._silent, strict=True)
+            ]
         self._open = False
         self._ended_counter, self._ended_ns = self._counter, self._start_ns
         self.counts.scans += 1

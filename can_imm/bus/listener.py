@@ -8,21 +8,26 @@ from can_imm.bus.codec import Field, compile_reader, field
 from can_imm.bus.encoder import DBC, DIRECTIONS, OUTPUT_IDS, StatusValues, own_dbc
 from can_imm.bus.frame import ERROR, EXTENDED, FD, REMOTE, Frame
 from can_imm.bus.protection import p01_data_id, p01_guard
+from can_imm.types import CUT_IN, CUT_OUT, OVERTAKING_ANOTHER
 
 NAN = float("nan")
+
+_FLAGS = (0, CUT_IN, CUT_OUT, OVERTAKING_ANOTHER)
+"""Bit of a report's flags by the value of signal Event."""
 
 
 class ManoeuvreMessage(NamedTuple):
     """ManoeuvreState; ``manoeuvre`` and ``second`` are values of `Manoeuvre`, ``direction`` is +1
-    left, -1 right, 0 none, ``lane`` -1 if not available; probabilities are 0 to 1, NaN if not
-    available."""
+    left, -1 right, 0 none, ``lane`` None if not available, ``flags`` one of the bits of a report's
+    or 0; probabilities are 0 to 1, NaN if not available."""
 
     object_id: int
     coasting: bool
     manoeuvre: int
     second: int
     direction: int
-    lane: int
+    lane: int | None
+    flags: int
     probability: float
     second_probability: float
     age: int
@@ -92,14 +97,15 @@ class ManoeuvreDecoder:
                 value("DistLat"),
                 value("VrelLat"),
             )
-        direction, lane = number("Direction"), number("Lane")
+        direction, lane, event = number("Direction"), value("Lane"), number("Event")
         return ManoeuvreMessage(
             number("ObjectId"),
             bool(number("Coasting")),
             number("Manoeuvre"),
             number("SecondManoeuvre"),
             DIRECTIONS[direction] if direction < len(DIRECTIONS) else 0,
-            lane if lane < 3 else -1,
+            None if lane != lane else int(lane),
+            _FLAGS[event],
             value("Probability") / 100,
             value("SecondProbability") / 100,
             number("TrackAge"),

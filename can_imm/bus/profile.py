@@ -1,74 +1,38 @@
-"""Sensor profiles: which message and signal of which DBC means what, as TOML beside the DBC."""
+"""Sensor profiles: which message and signal of which DBC means what, as TOML beside the DBC.
+
+The format is described at the top of ``dbc/ars408.toml``.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import can_imm
-from can_imm.bus.codec import Field, field, find_signal, load_dbc
-from can_imm.bus.protection import KINDS, p01_data_id
-from can_imm.tables import Table, builtin_names, read_table
+from can_imm.bus.codec import Field, field, find_signal
+from can_imm.bus.profile_parts import POLAR, STATES, Code, Header, Profile
+from can_imm.bus.profile_reading import (
+    Database,
+    read_code,
+    read_codes,
+    read_component,
+    read_condition,
+    read_ego,
+    read_kind,
+    read_milliseconds,
+    read_mounting,
+    read_sensors,
+    read_whole,
+)
+from can_imm.bus.protection import p01_data_id
+from can_imm.tables import builtin_names, read_table
 from can_imm.types import CanImmError
 
-STATES = ("x", "vx", "y", "vy")
-_LARGEST = 1e6
-"""No time in milliseconds, noise or offset is larger."""
+__all__ = ["STATES", "Profile", "builtin_profiles", "dbc_dir", "load_profile"]
 
-
-@dataclass(frozen=True)
-class Component:
-    """How a state is measured: ``sign * signal + offset``, noise ``std`` (SI units)."""
-
-    signal: str
-    std: float
-    sign: float
-    offset: float
-
-
-@dataclass(frozen=True)
-class Condition:
-    """The frame holds an object only if the physical value of ``signal`` is ``equals``, or lies
-    below ``below``; the other of the two is None."""
-
-    signal: str
-    equals: float | None
-    below: float | None
-
-
-@dataclass(frozen=True)
-class Header:
-    """The message that starts a scan, and its signal for the number of object frames."""
-
-    message: Any
-    count: str
-
-
-@dataclass(frozen=True)
-class Profile:
-    """A sensor. Messages are cantools messages; signals are named.
-
-    With a ``header`` a scan is the header and as many object frames as it announces; without one
-    it is one frame of each of ``messages``, and the signal ``counter`` tells the scans apart.
-    """
-
-    name: str
-    path: Path
-    description: str
-    dbc: Path
-    period_ns: int
-    timeout_ns: int
-    latency_ns: int
-    header: Header | None
-    counter: str
-    messages: tuple[Any, ...]
-    id: str | None
-    new: str | None
-    valid_if: tuple[Condition, ...]
-    state: tuple[Component | None, ...]
-    protection: str
-    protection_counter: str | None
+LONGEST_CODE = 12
+"""Bits of the longest signal that is looked up in a table."""
 
 
 def dbc_dir() -> Path:
@@ -83,8 +47,12 @@ def builtin_profiles() -> list[str]:
     return builtin_names(dbc_dir())
 
 
-def load_profile(name_or_path: str) -> Profile:
+def load_profile(name_or_path: str, *, sensor: int | None = None) -> Profile:
     """A built-in profile by name, or one from a TOML file; its DBC's path is relative to the TOML.
+
+    Args:
+        sensor: number of the sensor that counts, where several may share a bus; None leaves it to
+            the profile, which may leave it to the decoder (the first one that is heard).
 
     Raises:
         CanImmError: file missing or broken, or a key, message or signal that is wrong.
@@ -94,122 +62,139 @@ def load_profile(name_or_path: str) -> Profile:
     dbc = path.parent / top.text("dbc")
     description = top.text("description", "")
     scan, obj, protection = top.table("scan"), top.table("object"), top.table("protection")
+    several, mounted = top.table("sensors", {}), top.table("mounting", {})
+    moving = top.table("ego") if "ego" in top else None
+    named = read_codes(top.table("codes", {}))
     top.done()
-    database = load_dbc(dbc)
+    database = Database(dbc)
 
-    period_ns = _milliseconds(scan, "period_ms", least=1)
-    timeout_ns = _milliseconds(scan, "timeout_ms", least=1)
-    latency_ns = _milliseconds(scan, "latency_ms", least=0)
+    period_ns = read_milliseconds(scan, "period_ms", least=1)
+    timeout_ns = read_milliseconds(scan, "timeout_ms", least=1)
+    latency_ns = read_milliseconds(scan, "latency_ms", least=0)
     counter = scan.text("counter")
     header = None
     if "header" in scan:
-        header = Header(_message(scan, database, scan.text("header"), dbc), scan.text("count"))
+        header = Header(database.message(scan, scan.text("header")), scan.text("count"))
+    padded = scan.flag("padded", False)
     scan.done()
 
-    messages = _messages(obj, database, dbc)
+    messages = database.messages(obj, "messages", needed=True)
+    also = database.messages(obj, "also") if "also" in obj else ()
     id_signal = obj.text("id") if "id" in obj else None
-    new_signal = obj.text("new") if "new" in obj else None
     if (header is None) != (id_signal is None):
         raise obj.error("'id' is needed with, and only with, a scan header")
-    valid_if = tuple(_condition(table) for table in obj.tables("valid_if", []))
-    state = obj.table("state")
+    if also and id_signal is None:
+        raise obj.error("'also' needs an 'id' that ties the messages to an object")
+    new_signal = obj.text("new") if "new" in obj else None
+    new_codes = tuple(read_whole(obj, "new_codes")) if "new_codes" in obj else ()
+    valid_if = tuple(read_condition(table) for table in obj.tables("valid_if", []))
+    object_class = read_code(obj.table("class"), named) if "class" in obj else None
+    sizes = tuple(
+        read_code(obj.table(key), named) if key in obj else None for key in ("length", "width")
+    )
+    existence: Code | None = None
+    least = 0.0
+    if "existence" in obj:
+        table = obj.table("existence")
+        least = table.number("at_least", 0.0, low=0.0, high=1.0)
+        existence = read_code(table, named)
+    polar = "polar" in obj
+    if polar and "state" in obj:
+        raise obj.error("either 'state' or 'polar', not both")
+    state = obj.table("polar" if polar else "state")
     obj.done()
-    components = tuple(_component(state.table(s)) if s in state else None for s in STATES)
+
+    def find(signal: str) -> Any:
+        """The signal, None without one; what is missing is refused later."""
+        return next(
+            (m.get_signal_by_name(signal) for m in (messages[0], *also) if signal in m.signal_tree),
+            None,
+        )
+
+    keys = POLAR if polar else STATES
+    components = tuple(
+        read_component(state.table(k), k, find, named) if k in state else None for k in keys
+    )
     state.done()
     if not any(components):
         raise state.error("no state is measured")
+    if polar and not (components[0] and components[2]):
+        raise state.error("'range' and 'bearing' are both needed")
 
-    kind = protection.choice("kind", dict(zip(KINDS, KINDS, strict=True)))
+    kind = read_kind(protection, "kind")
     protection_counter = protection.text("counter") if kind == "toyota" else None
     protection.done()
+    sensors = read_sensors(several, header)
+    if sensor is not None:
+        if not 0 <= sensor < sensors.number:
+            raise CanImmError(f"{path}: has sensors 0 to {sensors.number - 1}, not {sensor}")
+        sensors = replace(sensors, use=sensor)
 
     profile = Profile(
         path.stem, path, description, dbc, period_ns, timeout_ns, latency_ns, header, counter,
-        messages, id_signal, new_signal, valid_if, components, kind, protection_counter,
+        messages, also, padded, id_signal, new_signal, new_codes, valid_if,
+        components if len(components) == len(STATES) else (*components, None), polar,
+        existence, least, object_class, (sizes[0], sizes[1]), kind, protection_counter, sensors,
+        read_mounting(mounted), read_ego(moving, database) if moving else None,
     )  # fmt: skip
     _check_messages(profile)
     return profile
 
 
-def _milliseconds(table: Table, key: str, *, least: float) -> int:
-    return round(table.number(key, low=least, high=_LARGEST) * 1e6)
-
-
-def _message(table: Table, database: Any, name: str, dbc: Path) -> Any:
-    try:
-        return database.get_message_by_name(name)
-    except KeyError:
-        raise table.error(f"no message {name!r} in {dbc}") from None
-
-
-def _messages(table: Table, database: Any, dbc: Path) -> tuple[Any, ...]:
-    """The messages of a list of names and of id ranges such as "0x210-0x21F"."""
-    messages: list[Any] = []
-    for entry in table.values("messages"):
-        first, _, last = str(entry).partition("-")
-        try:
-            ids = range(int(first, 0), int(last or first, 0) + 1)
-        except ValueError:
-            messages.append(_message(table, database, str(entry), dbc))
-            continue
-        known = {message.frame_id: message for message in database.messages}
-        for frame_id in ids[:4096]:
-            if frame_id not in known:
-                raise table.error(f"'messages': no message with id 0x{frame_id:X} in {dbc}")
-            messages.append(known[frame_id])
-    if not messages or len({message.frame_id for message in messages}) < len(messages):
-        raise table.error("'messages' must name at least one message, and none twice")
-    return tuple(messages)
-
-
-def _condition(table: Table) -> Condition:
-    condition = Condition(
-        table.text("signal"),
-        table.number("equals") if "equals" in table else None,
-        table.number("below") if "below" in table else None,
-    )
-    table.done()
-    if (condition.equals is None) == (condition.below is None):
-        raise table.error("needs either 'equals' or 'below'")
-    return condition
-
-
-def _component(table: Table) -> Component:
-    component = Component(
-        signal=table.text("signal"),
-        std=table.number("std", above=0.0, high=_LARGEST),
-        sign=table.number("sign", 1.0),
-        offset=table.number("offset", 0.0, low=-_LARGEST, high=_LARGEST),
-    )
-    table.done()
-    if component.sign not in (-1, 1):
-        raise table.error(f"'sign' must be 1 or -1, not {component.sign:g}")
-    return component
-
-
 def _check_messages(profile: Profile) -> None:
     """Refuse messages that we cannot decode and signals that are not there."""
-    wanted: list[tuple[Any, tuple[str, ...]]] = []
-    wanted += [(profile.header.message, (profile.header.count,))] if profile.header else []
-    names = [profile.id, profile.new, profile.protection_counter]
-    names += [condition.signal for condition in profile.valid_if]
-    names += [component.signal for component in profile.state if component]
-    wanted += [(message, tuple(filter(None, names))) for message in profile.messages]
-    counted = {wanted[0][0].name} if profile.header else {m.name for m in profile.messages}
-    fields: dict[tuple[bool, str], Field] = {}
+    first = profile.messages[0]
+    wanted: list[tuple[Any, list[str]]] = []
+    if profile.header:
+        wanted.append((profile.header.message, [profile.header.count, profile.counter]))
+    of_first = [profile.id] if profile.header else [profile.counter]
+    if profile.protection_counter is not None:
+        of_first.append(profile.protection_counter)
+        wanted += [(message, [profile.protection_counter]) for message in profile.also]
+    of_also: dict[str, list[str]] = {message.name: [] for message in profile.also}
+    for name in profile.object_signals():
+        source = profile.source(name)
+        of_also[source.name].append(name) if source in profile.also else of_first.append(name)
+    names = [name for name in of_first if name is not None]
+    wanted += [(message, names) for message in profile.messages]
+    wanted += [(m, [profile.id, *of_also[m.name]]) for m in profile.also if profile.id]
+    used = [*([profile.header.message] if profile.header else []), *profile.object_messages]
+    shared = profile.sensors
+    ids = {m.frame_id + n * shared.id_step for m in used for n in range(shared.number)}
+    if len(ids) < len(used) * shared.number:
+        raise CanImmError(f"{profile.path}: two messages with one id")
+    fields: dict[str, Field] = {}
+    codes = {code.signal for code in profile.codes()}
     for message, signals in wanted:
-        if message.is_extended_frame or message.is_fd or not 1 <= message.length <= 8:
-            raise CanImmError(
-                f"{profile.path}: message {message.name} of {profile.dbc.name} is not a classic "
-                "frame with an 11-bit id: not supported"
-            )
-        for name in (*signals, *([profile.counter] if message.name in counted else [])):
+        _check_frame(profile, message, profile.protection)
+        for name in signals:
             signal = find_signal(message, name, profile.path, profile.dbc)
-            first = fields.setdefault((message in profile.messages, name), field(signal))
-            if field(signal) != first:
+            if name in codes and signal.length > LONGEST_CODE:
                 raise CanImmError(
-                    f"{profile.path}: signal {name!r} of {message.name} has another scale or range "
-                    f"than in {profile.messages[0].name}"
+                    f"{profile.path}: signal {name!r} of {message.name} is longer than "
+                    f"{LONGEST_CODE} bits: not supported here"
                 )
-        if profile.protection == "e2e-p01":
-            p01_data_id(message, profile.dbc)
+            if message not in profile.messages:
+                continue
+            if fields.setdefault(name, field(signal)) != field(signal):
+                raise CanImmError(
+                    f"{profile.path}: signal {name!r} of {message.name} has another scale or "
+                    f"range than in {first.name}"
+                )
+    for part in profile.ego.parts if profile.ego else ():
+        if part is not None:
+            _check_frame(profile, part.message, part.protection)
+            for name in part.signals:
+                find_signal(part.message, name, profile.path, profile.dbc)
+            if part.message.frame_id in ids:
+                raise CanImmError(f"{profile.path}: {part.message.name} is also a sensor message")
+
+
+def _check_frame(profile: Profile, message: Any, protection: str) -> None:
+    if message.is_extended_frame or message.is_fd or not 1 <= message.length <= 8:
+        raise CanImmError(
+            f"{profile.path}: message {message.name} of {profile.dbc.name} is not a classic "
+            "frame with an 11-bit id: not supported"
+        )
+    if protection == "e2e-p01":
+        p01_data_id(message, profile.dbc)

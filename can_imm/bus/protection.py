@@ -20,7 +20,7 @@ class Guard(NamedTuple):
     """The checks of one message id.
 
     ``check(data)`` is true if the checksum is right; ``counter(data)`` the alive counter, which
-    runs from 0 to ``modulus - 1``.
+    runs from 0 to ``modulus - 1``; with modulus 0 nobody is to look at it.
     """
 
     check: Callable[[bytes], bool]
@@ -60,8 +60,20 @@ def p01_protect(data: bytearray, data_id: int, counter: int) -> None:
 
 
 def toyota_guard(
-    frame_id: int, length: int, counter: Callable[[bytes], int], modulus: int
+    frame_id: int,
+    length: int,
+    counter: Callable[[bytes], int] = lambda data: 0,
+    modulus: int = 0,
 ) -> Guard:
     """Toyota's checksum in the last byte: sum of the other bytes, the id's bytes and the length."""
-    head = (frame_id & 0xFF) + (frame_id >> 8) + length
+    head = _toyota_head(frame_id, length)
     return Guard(lambda data: (sum(data[:-1]) + head) & 0xFF == data[-1], counter, modulus)
+
+
+def toyota_protect(data: bytearray, frame_id: int) -> None:
+    """Write Toyota's checksum into the last byte of ``data``."""
+    data[-1] = (sum(data[:-1]) + _toyota_head(frame_id, len(data))) & 0xFF
+
+
+def _toyota_head(frame_id: int, length: int) -> int:
+    return (frame_id & 0xFF) + (frame_id >> 8) + length

@@ -20,7 +20,7 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from can_imm.cli.bus_options import add_bus_arguments, bus_name, open_bus_from
-from can_imm.cli.detection import add_detector_arguments, build, print_summary, summary_console
+from can_imm.cli.detection import Equipment, add_detector_arguments, print_summary, summary_console
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from can_imm.bus.sinks import BusSink
     from can_imm.bus.sources import BusSource
     from can_imm.runtime.health import Health
+
+NAME = "can-imm detect"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,8 +60,9 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         bus = stack.enter_context(open_bus_from(args))
         source, sink = BusSource(bus), BusSink(bus)
-        detection = build(args)
-        stack.callback(detection.close)
+        equipment = Equipment(args)
+        stack.callback(equipment.close)
+        detection = equipment.detection(NAME)
         # last, because it replaces an existing file: what is wrong with the options has been said
         log = LogSink(args.log) if args.log else None
         if log is not None:
@@ -90,6 +93,8 @@ def run(args: argparse.Namespace) -> int:
         finally:
             gc.unfreeze()
         dropped = queue.drops()
+        detection.finish()
+        equipment.keep_events(NAME, detection)
 
     response = health.response
     more = [
@@ -106,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
             f"{response.quantile_ns(0.99) / 1e6:.2f} ms, worst {response.max_ns / 1e6:.2f} ms",
         ),
     ]
-    print_summary(summary_console(args), detection, "can-imm detect", more)
+    print_summary(summary_console(args), detection, NAME, more)
     if gone is not None:
         raise gone
     if log is not None and log.damage:

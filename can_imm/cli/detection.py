@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,9 +14,15 @@ if TYPE_CHECKING:
 
     from can_imm.bus.decoder import DecodeCounts
     from can_imm.bus.encoder import ManoeuvreEncoder
-    from can_imm.cli.reports import LaneChanges, ReportCsv
+    from can_imm.detector import Detector
+    from can_imm.events import Event, EventCollector
+    from can_imm.plots.history import History
     from can_imm.runtime.health import Health
-    from can_imm.runtime.nodes import DetectorNode
+    from can_imm.runtime.nodes import DetectorNode, Listener
+    from can_imm.runtime.smoothed import Smoothed
+
+MOST_EVENTS = 30
+"""Rows of the table of events; a file takes them all."""
 
 
 def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,13 +31,19 @@ def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
         "--profile",
         default="can_imm",
         metavar="NAME|FILE",
-        help="the sensor: can_imm (default), toyota, or a TOML file",
+        help="the sensor: can_imm (default), another one of 'can-imm profiles', or a TOML file",
+    )
+    parser.add_argument(
+        "--sensor",
+        type=whole_int,
+        metavar="N",
+        help="of several such sensors on the bus, the one with this number",
     )
     parser.add_argument(
         "--preset",
         default="two-lane",
         metavar="NAME|FILE",
-        help="the mode bank: two-lane (default), paper, or a TOML file",
+        help="the mode bank: two-lane (default), motorway, paper, or a TOML file",
     )
     parser.add_argument(
         "--objects",
@@ -48,6 +61,15 @@ def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--csv", metavar="OUT", help="write one row per object and scan; - is standard output"
     )
+    parser.add_argument(
+        "--events", metavar="FILE", help="write all events to this .csv or .json file"
+    )
+    parser.add_argument(
+        "--lag",
+        type=float,
+        metavar="S",
+        help="CSV and events say what is known S seconds later; the frames stay as they are",
+    )
 
 
 def positive_int(text: str) -> int:
@@ -57,58 +79,123 @@ def positive_int(text: str) -> int:
     return int(text)
 
 
+def whole_int(text: str) -> int:
+    """Parse a whole number from 0 up, for argparse."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 up, not {text!r}")
+    return int(text)
+
+
 @dataclass
 class Detection:
-    """A detector node with everything that listens to it."""
+    """A detector node with everything that listens to it, for one bus or recording."""
 
     node: DetectorNode
     encoder: ManoeuvreEncoder
     health: Health
-    changes: LaneChanges
-    csv: ReportCsv | None
+    events: EventCollector
+    smoothed: Smoothed | None
 
-    def close(self) -> None:
-        if self.csv is not None:
-            self.csv.close()
+    def finish(self) -> None:
+        """No more scans will come: conclude what waits for its end."""
+        if self.smoothed is not None:
+            self.smoothed.finish()
+        self.events.finish()
 
 
-def build(args: argparse.Namespace) -> Detection:
-    """Allocate, validate and compile everything that the options ask for.
+class Equipment:
+    """What the options ask for, loaded, checked and opened once, for any number of recordings.
+
+    Args:
+        args: of a parser with `add_detector_arguments`.
+        several: more than one recording will be written.
 
     Raises:
         CanImmError: a profile, DBC or preset is missing or wrong.
-        OSError: the CSV file cannot be written.
+        OSError: a file cannot be written.
     """
-    with announced():
-        from can_imm.bus.decoder import ScanDecoder
-        from can_imm.bus.encoder import ManoeuvreEncoder
-        from can_imm.bus.profile import load_profile
-        from can_imm.cli.reports import LaneChanges, ReportCsv
-        from can_imm.detector import Detector
-        from can_imm.manoeuvres import load_bank
-        from can_imm.runtime.health import Health
-        from can_imm.runtime.nodes import DetectorNode, Listener
 
-        decoder = ScanDecoder(load_profile(args.profile), args.objects)
-        bank = load_bank(args.preset)
-        health, changes = Health(), LaneChanges()
-        listeners: list[Listener] = [changes]
-        csv = ReportCsv(args.csv) if args.csv else None
-        if csv is not None:
-            listeners.append(csv)
-        # last, because it may compile: what is wrong with the options has been said by now
-        detector = Detector(bank, capacity=args.objects)
-        encoder = ManoeuvreEncoder()
-        node = DetectorNode(
-            decoder,
-            detector,
-            encoder,
-            health,
-            listeners,
-            args.objects,
-            every_step=args.estimates == "step",
-        )
-    return Detection(node, encoder, health, changes, csv)
+    def __init__(self, args: argparse.Namespace, *, several: bool = False) -> None:
+        with announced():
+            from can_imm.bus.profile import load_profile
+            from can_imm.cli.reports import EventFile, ReportCsv
+            from can_imm.manoeuvres import load_bank
+            from can_imm.types import Manoeuvre
+
+            self._args = args
+            self.profile = load_profile(args.profile, sensor=args.sensor)
+            self.bank = load_bank(args.preset)
+            self._files = ExitStack()
+            self.csv = self.event_file = None
+            if args.events:
+                self.event_file = EventFile(args.events, several=several)
+                self._files.callback(self.event_file.close)
+            if args.csv:
+                motorway = Manoeuvre.KEEP_LANE in self.bank.manoeuvres
+                self.csv = ReportCsv(args.csv, motorway=motorway, with_log=several)
+                self._files.callback(self.csv.close)
+
+    def detection(self, name: str, history: History | None = None) -> Detection:
+        """Return a fresh detector for the recording ``name``; it may have to be compiled.
+
+        Its reports go, smoothed if the options say so, to the CSV file, to the events, and to the
+        ``history`` for a picture.
+        """
+        with announced():
+            from can_imm.bus.decoder import ScanDecoder
+            from can_imm.bus.encoder import ManoeuvreEncoder
+            from can_imm.detector import Detector
+            from can_imm.events import EventCollector
+            from can_imm.runtime.health import Health
+            from can_imm.runtime.nodes import DetectorNode
+
+            health, events, encoder = Health(), EventCollector(), ManoeuvreEncoder()
+            objects = self._args.objects
+            detector = Detector(self.bank, capacity=objects)
+            listeners: list[Listener] = []
+            final: list[Listener] = [events]  # hear what is said in the end
+            if self.csv is not None:
+                self.csv.log = name
+                final.append(self.csv)
+            if history is not None:
+                history.road = detector.road
+                listeners.append(history.watch)
+                final.append(history)
+            smoothed = self._smoothed(detector, final)
+            node = DetectorNode(
+                ScanDecoder(self.profile, objects),
+                detector,
+                encoder,
+                health,
+                [*listeners, smoothed] if smoothed else listeners + final,
+                objects,
+                every_step=self._args.estimates == "step",
+            )
+        return Detection(node, encoder, health, events, smoothed)
+
+    def _smoothed(self, detector: Detector, listeners: list[Listener]) -> Smoothed | None:
+        """The smoother that the options ask for, between the detector and the listeners."""
+        from can_imm.runtime.smoothed import Smoothed
+        from can_imm.smoothing import FixedIntervalSmoother, FixedLagSmoother
+
+        smoother: FixedIntervalSmoother | FixedLagSmoother
+        if getattr(self._args, "smooth", False):
+            smoother = FixedIntervalSmoother(self.bank)
+        elif self._args.lag is not None:
+            smoother = FixedLagSmoother(self.bank, self._args.lag)
+        else:
+            return None
+        detector.history = smoother
+        return Smoothed(smoother, listeners)
+
+    def keep_events(self, name: str, detection: Detection) -> None:
+        """Write the events of the recording ``name``, now that it has ended."""
+        if self.event_file is not None:
+            self.event_file.add(name, detection.events)
+
+    def close(self) -> None:
+        """Close the files."""
+        self._files.close()
 
 
 def summary_console(args: argparse.Namespace) -> Console:
@@ -124,8 +211,6 @@ def print_summary(
     """Print what was read, rejected and found; ``more`` are further lines (name, text)."""
     from rich.markup import escape
 
-    from can_imm.cli.reports import DIRECTION, seconds
-
     counts = detection.node.decoder.counts
     found = detection.node.detector.counts
     lines = [
@@ -139,20 +224,68 @@ def print_summary(
         ("objects", _join(seen=found.births, still_there=detection.node.detector.n_tracked,
                           outliers=found.outliers, without_a_slot=found.overflow)),
         *more,
+        ("manoeuvres", _shares(detection.events)),
     ]  # fmt: skip
     console.print(f"[bold]{escape(title)}[/]")
     for name, text in lines:
         console.print(f"  [dim]{name:<10}[/] {escape(text)}")
-    changes = detection.changes.found
-    if not changes:
-        console.print("[bold]no lane changes[/]")
+    _print_events(console, detection.events.found)
+
+
+def _print_events(console: Console, events: list[Event]) -> None:
+    """The table of events, at most `MOST_EVENTS` rows."""
+    from can_imm.cli.reports import DIRECTION, seconds
+
+    if not events:
+        console.print("[bold]no events[/]")
         return
-    console.print("[bold]lane changes[/]")
-    console.print(f"  [dim]{'from':>17}  {'to':>17}  object  direction[/]")
-    for change in changes:
-        first, last = seconds(change.first_ns)[:-3], seconds(change.last_ns)[:-3]
-        direction = DIRECTION[change.direction]
-        console.print(f"  {first:>17}  {last:>17}  {change.object_id:>6}  {direction}".rstrip())
+    console.print("[bold]events[/] [dim](gap and relative speed at the start, in m and m/s)[/]")
+    console.print(
+        f"  [dim]{'from':>14}  {'to':>14}  object  {'manoeuvre':<17}  {'lane':<8}  {'event':<10}"
+        "  mean p     gap  least   speed[/]"
+    )
+    for event in weightiest(events, MOST_EVENTS):
+        what = event.manoeuvre.name.replace("_", " ").lower()
+        what = f"{what} {DIRECTION[event.direction]}".rstrip()
+        lanes = f"{event.lane_from}"
+        if event.lane_to != event.lane_from:
+            lanes += f" to {event.lane_to}"
+        first, last = (seconds(t_ns)[:-3] for t_ns in (event.from_ns, event.to_ns))
+        console.print(
+            f"  {first:>14}  {last:>14}  {event.object_id:>6}  {what:<17}  {lanes:<8}  "
+            f"{event.event.replace('_', ' ').lower():<10}  {event.probability:6.2f}  "
+            f"{event.gap:6.1f} {event.min_gap:6.1f}  {event.speed:+6.1f}"
+        )
+    if len(events) > MOST_EVENTS:
+        console.print(f"  [dim]... {len(events) - MOST_EVENTS:,} more, --events FILE has all[/]")
+
+
+def weightiest(events: list[Event], most: int) -> list[Event]:
+    """At most so many of the events, in their order: those with a name of their own stay longest,
+    then goes the order of `EVENTS`, then the duration."""
+    from can_imm.events import EVENTS
+
+    def weight(event: Event) -> tuple[bool, int, int]:
+        return not event.event, EVENTS.index(event.manoeuvre), event.from_ns - event.to_ns
+
+    kept = sorted(range(len(events)), key=lambda i: weight(events[i]))[:most]
+    return [events[i] for i in sorted(kept)]
+
+
+def _shares(events: EventCollector) -> str:
+    """Number of objects, and the manoeuvres' shares in their time."""
+    from can_imm.events import COUNTED
+
+    parts = [
+        f"{m.name.replace('_', ' ').lower()} {100 * share:.1f} %"
+        for m, share in events.share().items()
+    ]
+    counted = ", ".join(f"{n} {m.name.lower()}" for m in COUNTED if (n := events.counted[m]))
+    return (
+        f"{events.objects:,} object{'s' * (events.objects != 1)}"
+        + (f" ({counted} at some time)" if counted else "")
+        + (f"; of their time: {', '.join(parts)}" if parts else "")
+    )
 
 
 REASONS = {

@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         Path(args.json).write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     if args.plot:
-        from can_imm.plots import latency_figure
+        from can_imm.plots.latency import latency_figure
 
         rounds = measurement.rounds
         latency_figure(Path(args.plot), {**rounds.stages, "echo": rounds.echo})

@@ -35,6 +35,7 @@ COMMANDS = {
     "track": "make objects of the detections of several sensors, on a bus or in a log",
     "detect": "listen on a bus and answer with manoeuvre frames until Ctrl-C",
     "replay": "run the detector over a recorded log",
+    "profiles": "list the radars that can be read, or explain a profile of your own",
     "latency": "measure how long answers take on a bus, stage by stage",
     "bench": "measure the speed beside filterpy, cantools and python-can",
     "study": "measure the detector by Monte Carlo and draw the paper's figures",

@@ -4,6 +4,7 @@
   can-imm simulate -i socketcan -c vcan0 --scenario random --seed 7
   can-imm simulate --log drive.log --truth drive.csv   as fast as possible, no bus
   can-imm simulate --scenario mine.toml --log mine.blf
+  can-imm simulate --scenario motorway --profile ars408 --log drive.log --truth drive.csv
   can-imm simulate --scenario cooperative -i udp_multicast     detections, for 'can-imm track'
 
 A bus is used when a bus option is given, or when there is no file to write; it plays in real time.
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from can_imm.cli.simulate_motorway import Moment
     from can_imm.runtime.nodes import SenderNode
     from can_imm.sim.scene import SceneRun
     from can_imm.sim.truth import Truth
@@ -40,9 +42,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scenario",
         default="paper-a",
-        metavar="NAME|FILE|random",
-        help="paper-a (default), paper-b, paper-s, random, or a TOML file; cooperative, roadside "
-        "or the TOML file of such a scene: detections of several sensors",
+        metavar="NAME|FILE|random|motorway",
+        help="paper-a (default), paper-b, paper-s, random, or a TOML file; motorway: random "
+        "traffic around the vehicle; cooperative, roadside or the TOML file of such a scene: "
+        "detections of several sensors",
+    )
+    parser.add_argument(
+        "--profile",
+        default="can_imm",
+        metavar="NAME",
+        help="the motorway's radar: can_imm (default), ars408, esr, toyota, toyota-tss2",
+    )
+    parser.add_argument(
+        "--settings",
+        default="tuning",
+        metavar="NAME",
+        help="ranges from which the motorway's traffic is drawn: tuning (default) or reporting",
     )
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="of noise and random scenario (default: 0)"
@@ -50,16 +65,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--missed",
         type=float,
-        default=0.0,
         metavar="P",
-        help="probability that an object is missing from a scan (default: 0)",
+        help="probability that an object is missing from a scan (default: 0; "
+        "on the motorway the radar's own)",
     )
     parser.add_argument(
         "--dropout",
         type=float,
-        default=0.0,
         metavar="P",
-        help="probability that a whole scan is missing (default: 0)",
+        help="probability that a whole scan is missing (default: 0; on the "
+        "motorway the radar's own)",
     )
     parser.add_argument(
         "--log", metavar="FILE", help="write the frames to a log; its ending chooses the format"
@@ -94,15 +109,23 @@ def run(args: argparse.Namespace) -> int:
     kind = scene_kind(args.scenario)
     played = None
     truths: list[Truth] = []
-    sender: SenderNode[Scan] | SenderNode[DetectionScan]
-    if kind is not None:
+    motorway = None
+    sender: SenderNode[Scan] | SenderNode[DetectionScan] | SenderNode[Moment]
+    if args.scenario != "motorway" and args.profile != "can_imm":
+        raise CanImmError("--profile: only the motorway is played for other radars")
+    if args.scenario == "motorway":
+        from can_imm.cli.simulate_motorway import play_motorway
+
+        motorway = play_motorway(rng, args.settings, args.profile, args.missed, args.dropout)
+    elif kind is not None:
         if args.missed or args.dropout:
             raise CanImmError("--missed and --dropout: a scene's own table says this")
         played = play(kind, args.scenario, rng)
     else:
         random = args.scenario == "random"
         truths = simulate(random_scenario(rng) if random else load_scenario(args.scenario))
-        scans = measure(truths, SensorModel(missed=args.missed, dropout=args.dropout), rng)
+        sensor = SensorModel(missed=args.missed or 0.0, dropout=args.dropout or 0.0)
+        scans = measure(truths, sensor, rng)
 
     with ExitStack() as stack:
         outputs = []
@@ -120,7 +143,15 @@ def run(args: argparse.Namespace) -> int:
         if log is not None:
             stack.callback(log.close)
         health = Health()
-        if played is not None:
+        if motorway is not None:
+            from can_imm.cli.simulate_motorway import write_motorway_truth
+
+            if args.truth:
+                write_motorway_truth(args.truth, motorway.truth, start_ns)
+            moments = Player(motorway.moments, start_ns)
+            done, sender = lambda: moments.done, SenderNode(moments, motorway.encoder)
+            what = f"{len(motorway.truth.objects)} objects, {motorway.n_scans} scans"
+        elif played is not None:
             if args.truth:
                 write_scene_truth(args.truth, played, start_ns)
             detections = Player(played.scans, start_ns)

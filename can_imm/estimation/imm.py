@@ -169,7 +169,7 @@ def surprise(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
-def order_modes_(bank: Any, work: Any) -> None:  # pragma: no cover - compiled
+def order_modes_(bank: Any, obj: Any, work: Any) -> None:  # pragma: no cover - compiled
     """Probabilities of the modes before the measurement into work.c, and into work.order the
     likeliest first, for the others to be held against, and the particles last: they cost most."""
     n_modes = bank.n_modes
@@ -178,7 +178,7 @@ def order_modes_(bank: Any, work: Any) -> None:  # pragma: no cover - compiled
     for i in range(n_modes):
         if work.mu[i] > 0.0:
             for j in range(n_modes):
-                work.c[j] += work.Pi[i, j] * work.mu[i]
+                work.c[j] += obj.Pi[i, j] * work.mu[i]
     first = -1
     last = n_modes
     for j in range(n_modes):
@@ -246,9 +246,10 @@ def cycle_(
     if surprise(bank, obj, m, z, r, valid, age, work.angle) > gate:
         return OUTLIER
     work.lane_width = obj.lane_width
+    work.elapsed = m * bank.step_s
     present_(bank, obj, work.mu)
     transitions_(n, bank, obj, work, m)
-    order_modes_(bank, work)
+    order_modes_(bank, obj, work)
     peak = peak_density(r, valid)
     worth = math.log(bank.mu_floor * NEGLIGIBLE_RISE)  # -inf without a floor
     best = -np.inf
@@ -260,7 +261,7 @@ def cycle_(
             work.c[j] = 0.0
         elif math.log(c) + peak > best + worth:
             for i in range(n_modes):
-                p = work.Pi[i, j] * work.mu[i]
+                p = obj.Pi[i, j] * work.mu[i]
                 work.w[i] = p / c if p > NEGLIGIBLE_WEIGHT * c else 0.0
             if not bank.is_particle[j]:
                 mix_(n, bank, obj, work, j, m)
@@ -305,6 +306,7 @@ def birth_(
     cos, sin = math.cos(work.angle), math.sin(work.angle)
     obj.lane_scans = 0.0
     work.lane_width = obj.lane_width
+    work.elapsed = 0.1
     for j in range(n_modes):
         x = work.x[j]
         P = work.P[j]

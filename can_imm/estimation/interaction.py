@@ -87,7 +87,7 @@ def mix_(
 def transitions_(
     n: int, bank: Any, obj: Any, work: Any, m: int
 ) -> None:  # pragma: no cover - compiled
-    """State-dependent transition probabilities of this cycle into work.Pi.
+    """State-dependent transition probabilities of this cycle into obj.Pi.
 
     A bound with ``mass`` is a region outside of which the mode does not exist.  The probability of
     going from i to j is that of the chain times the mass which source i, moved on by ``m`` steps
@@ -98,6 +98,8 @@ def transitions_(
     n_modes = bank.n_modes
     for i in range(n_modes):
         if work.mu[i] == 0.0:
+            for j in range(n_modes):
+                obj.Pi[i, j] = bank.Pi[m, i, j]
             continue
         done = 0  # bits of the states that have been moved on
         total = 0.0
@@ -126,15 +128,15 @@ def transitions_(
                     (bank.bound_lower[j, c] - base) * work.var[s],
                     (bank.bound_upper[j, c] - base) * work.var[s],
                 )
-            work.Pi[i, j] = p
+            obj.Pi[i, j] = p
             total += p
         if total > 1e-30:
             scale = 1.0 / total
             for j in range(n_modes):
-                work.Pi[i, j] *= scale
+                obj.Pi[i, j] *= scale
         else:
             for j in range(n_modes):
-                work.Pi[i, j] = bank.Pi[m, i, j]
+                obj.Pi[i, j] = bank.Pi[m, i, j]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)

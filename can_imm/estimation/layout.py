@@ -83,6 +83,7 @@ BANK_DTYPE = np.dtype(
         ("n_soft", np.int8, (_M,)),
         ("soft_kind", np.int8, (_M, _K)),
         ("soft_state", np.int8, (_M, _K)),
+        ("soft_density", np.int8, (_M, _K)),
         ("n_bounds", np.int8, (_M,)),
         ("bound_state", np.int8, (_M, _K)),
         ("bound_kind", np.int8, (_M, _K)),
@@ -96,6 +97,7 @@ BANK_DTYPE = np.dtype(
 Tables are indexed by the number of elapsed steps: ``F[m]``, ``Q[m]``, ``Pi[m]`` belong to m steps;
 ``Pi[m, i, j]`` is the probability of going from mode i to mode j.  Bit s of ``entry_sources[i, j]``
 says that state s is replaced when j is entered from i; ``entry_var`` is negative where it never is.
+``soft_density``: the row's variance is ``soft_r`` divided by the time since the last measurement.
 ``off_lane``: what is in this mode says nothing of where the lanes are.
 ``rear_end_gap``: APPROACHING in the ego's lane is reported as REAR_END up to this gap [m]; 0 never.
 """
@@ -108,12 +110,15 @@ OBJECT_DTYPE = np.dtype(
         ("log_l", np.float64, (_M,)),
         ("mean", np.float64, (_N,)),
         ("cov", np.float64, (_N, _N)),
+        ("Pi", np.float64, (_M, _M)),
         ("lane_width", np.float64),
         ("lane_scans", np.float64),
     ],
     align=True,
 )
 """Estimator state of one object: per mode at its last measurement, and the combined estimate.
+
+``Pi`` are the transition probabilities of the last cycle; a smoother goes back through them.
 
 ``lane_width`` is the distance of the lane centres that this object keeps to, learned in
 ``lane_scans`` scans.
@@ -134,11 +139,11 @@ WORK_DTYPE = np.dtype(
         ("L", np.float64, (4, 4)),
         ("lower", np.float64, (_K,)),
         ("upper", np.float64, (_K,)),
-        ("Pi", np.float64, (_M, _M)),
         ("var", np.float64, (_N,)),
         ("lane_width", np.float64),
         ("ground", np.float64),
         ("angle", np.float64),
+        ("elapsed", np.float64),
         ("source", np.int64, (_M,)),
         ("order", np.int64, (_M,)),
     ],

@@ -54,7 +54,10 @@ def constrain_soft_(
         value = bank.soft_value[j, c] + reference(
             bank.soft_kind[j, c], bank.soft_lanes[j, c], work, x[s]
         )
-        bad += 0.0 * update_state_(n, x, P, s, value, bank.soft_r[j, c], work.row)[1]
+        r = bank.soft_r[j, c]
+        if bank.soft_density[j, c]:
+            r /= work.elapsed
+        bad += 0.0 * update_state_(n, x, P, s, value, r, work.row)[1]
     return bad
 
 

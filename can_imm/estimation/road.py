@@ -1,21 +1,22 @@
 """The road ahead and the ego vehicle's place on it, from its own motion and from the traffic.
 
 Lanes are measured against the ego vehicle, which itself wanders in its lane, changes it, and drives
-through bends.  A Kalman filter keeps apart what the traffic does and what the ego does.  Its state:
+through bends.  One Kalman filter keeps apart what the road, the ego and the others do.  Its state:
 
     offset of the ego from the middle of its lane, to the left [m]
     heading of the ego against the lane, to the left [rad]
-    curvature of the road at the ego, positive to the left [1/m], and its change along the road [1/m²]
+    curvature of the road at the ego, to the left [1/m], and its change along the road [1/m²]
     error of the yaw rate sensor [rad/s]
     heading of the radar's axes against the vehicle's [rad]
     width of the lanes [m]
+    and for each of up to `N_GUIDES` vehicles its lateral place on the road [m].
 
 The middle of lane k, counted from the ego's lane to the left, is expected at
 
-    y(x) = k width - offset - (heading + mounting) x + curvature x²/2 + change x³/6.
+    y(x) = k width - offset - (heading + mounting) x + curvature x²/2 + change x³/6
 
-The clothoid model is that of Dickmanns and Mysliwetz (1992); here the lanes are seen through the vehicles
-that keep to them, whose wander in their lane counts as noise that lasts for seconds.
+(the clothoid of Dickmanns and Mysliwetz, 1992).  The vehicles' places hardly change, and in the
+long run they are the middles of lanes; what all of them do at once the road or the ego has done.
 """
 
 from __future__ import annotations
@@ -26,11 +27,14 @@ from typing import Any
 import numba
 import numpy as np
 
-from can_imm.types import FloatArray
+from can_imm.types import FloatArray, IntArray
 
 OFFSET, HEADING, CURVATURE, CHANGE, BIAS, MOUNTING, WIDTH = range(7)
 """Indices of the state."""
 N_ROAD = 7
+N_GUIDES = 24
+"""Most vehicles that the road is seen by."""
+N = N_ROAD + N_GUIDES
 
 PARAMETERS = (
     "width",
@@ -40,6 +44,8 @@ PARAMETERS = (
     "offset_time",
     "heading_std",
     "heading_time",
+    "turn_std",
+    "turn_time",
     "curvature_std",
     "curvature_length",
     "change_std",
@@ -51,35 +57,54 @@ PARAMETERS = (
     "drift",
     "wander_std",
     "wander_time",
+    "freedom",
+    "freedom_changing",
     "error_weight",
+    "error_most",
+    "speed_error_weight",
+    "speed_error_most",
 )
 """Names of the parameters, in their order in the array.
 
-``width``, ``offset`` and their standard deviations [m] before any traffic was seen; ``*_std`` of heading
-[rad], curvature [1/m], its change [1/m²], yaw rate error [rad/s], mounting [rad]: how large they get;
-``*_time`` [s] and ``*_length`` [m]: how long they stay the same; ``yaw_noise`` [rad/√s] of the heading
-from the yaw rate, and without it; ``drift`` [m/√s] of the offset; ``wander_std`` [m] and
-``wander_time`` [s] of a vehicle in its lane; ``error_weight`` by how much the variance of this
-estimate counts more than that of white noise, since it stays for long.
+``width``, ``offset`` and their standard deviations [m] before any traffic was seen; ``*_std`` of
+heading [rad], turning against the road [rad/s], curvature [1/m], its change [1/m²], yaw rate error
+[rad/s] and mounting [rad]: how large they get; ``*_time`` [s] and ``*_length`` [m]: how long they
+stay the same; ``yaw_noise`` [rad/√s] of the heading from the yaw rate, and without it; ``drift``
+[m/√s] of the offset; ``wander_std`` [m] and ``wander_time`` [s] of a vehicle in its lane;
+``freedom`` [m/√s] of its place, and while it changes lanes; ``*_weight``: by how much
+more the variances of this estimate count than those of white noise, since its errors last;
+``*_most`` [m, m/s]: no larger error is added to the measurements' noise: however little is known of
+where the lanes are far ahead, that a vehicle moves across them is seen.
 """
 (
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,
-    P_CURVATURE_STD, P_CURVATURE_LENGTH, P_CHANGE_STD, P_CHANGE_LENGTH, P_BIAS_STD, P_MOUNTING_STD,
-    P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_WANDER_STD, P_WANDER_TIME, P_ERROR_WEIGHT,
+    P_TURN_STD, P_TURN_TIME, P_CURVATURE_STD, P_CURVATURE_LENGTH, P_CHANGE_STD, P_CHANGE_LENGTH,
+    P_BIAS_STD, P_MOUNTING_STD, P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_WANDER_STD,
+    P_WANDER_TIME, P_FREEDOM, P_FREEDOM_CHANGING, P_ERROR_WEIGHT, P_ERROR_MOST, P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST,
 ) = range(len(PARAMETERS))  # fmt: skip
 
 USUAL_SPEED = 25.0
 """Taken for the ego's where it is unknown [m/s]."""
 
-FAR = 180.0
-"""Beyond this distance [m] the cubic says nothing any more: the road is taken to end there."""
+FAR = 100.0
+"""Beyond this distance [m] the road is taken to go on straight."""
+
+SEEN_TO = 150.0
+"""Vehicles further away [m] do not guide."""
+
+GATE = 16.0
+"""Squared normalised innovation above which a guide is not where it was."""
+
+FREE = -1
+"""Entry of ``guide_slot`` that is not in use."""
 
 
 def new_road(par: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """State (7,) and covariance (7, 7) before anything was seen."""
-    x = np.zeros(N_ROAD)
+    """State (31,) and covariance (31, 31) before anything was seen."""
+    x = np.zeros(N)
     x[OFFSET], x[WIDTH] = par[P_OFFSET], par[P_WIDTH]
-    std = [
+    std = np.zeros(N)
+    std[:N_ROAD] = [
         par[k]
         for k in (
             P_OFFSET_STD, P_HEADING_STD, P_CURVATURE_STD, P_CHANGE_STD, P_BIAS_STD,
@@ -91,33 +116,37 @@ def new_road(par: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def scalar_update_(
-    x: FloatArray, P: FloatArray, h: FloatArray, z: float, r: float, gate: float
+    x: FloatArray, P: FloatArray, h: FloatArray, g: int, z: float, r: float, gate: float
 ) -> bool:  # pragma: no cover - compiled
-    """Kalman update of all states by one value z = h x + noise of variance r, in place.
+    """Kalman update by one value z = h x + noise of variance r, in place.
+
+    Args:
+        x: (31,).  P: (31, 31).  h: (8,) row: the road's states, and that of guide g.
+        g: number of the guide, `FREE` for none.
 
     Returns:
         False, and nothing changed, if its squared normalised innovation is above ``gate``.
     """
-    n = x.shape[0]
     e, s = z, r
-    k = np.empty(N_ROAD)
-    for i in range(n):
-        e -= h[i] * x[i]
-        v = 0.0
-        for j in range(n):
-            v += P[i, j] * h[j]
-        k[i] = v
-        s += h[i] * v
+    k = np.zeros(N)
+    for j in range(N_ROAD + 1):
+        c = j if j < N_ROAD else N_ROAD + g
+        if h[j] == 0.0 or (j == N_ROAD and g < 0):
+            continue
+        e -= h[j] * x[c]
+        for i in range(N):
+            k[i] += P[i, c] * h[j]
+    for j in range(N_ROAD + 1):
+        if j < N_ROAD or g >= 0:
+            s += h[j] * k[j if j < N_ROAD else N_ROAD + g]
     if not (s > 0.0 and e * e <= gate * s):
         return False
-    for i in range(n):
+    for i in range(N):
+        if k[i] == 0.0:
+            continue
         x[i] += k[i] * e / s
-    for i in range(n):
-        for j in range(n):
-            P[i, j] -= k[i] * k[j] / s
-    for i in range(n):
-        for j in range(i):
-            v = 0.5 * (P[i, j] + P[j, i])
+        for j in range(i + 1):
+            v = P[i, j] - k[i] * k[j] / s
             P[i, j] = v
             P[j, i] = v
     return True
@@ -130,7 +159,7 @@ def predict_road_(
     """Move the ego on by ``dt`` seconds, in place.
 
     Args:
-        x: (7,).  P: (7, 7).  par: `PARAMETERS`.
+        x: (31,).  P: (31, 31).  par: `PARAMETERS`.
         speed, yaw_rate: of the ego [m/s, rad/s]; NaN where unknown.
     """
     known = speed == speed and yaw_rate == yaw_rate
@@ -139,44 +168,61 @@ def predict_road_(
     F[CURVATURE, CURVATURE] = math.exp(-abs(v) * dt / par[P_CURVATURE_LENGTH])
     F[CURVATURE, CHANGE] = v * dt
     F[CHANGE, CHANGE] = math.exp(-abs(v) * dt / par[P_CHANGE_LENGTH])
+    F[OFFSET, HEADING] = v * dt
     turned = 0.0
     if known:
-        F[OFFSET, HEADING] = v * dt
         F[OFFSET, CURVATURE] = -0.5 * v * v * dt * dt
         F[OFFSET, BIAS] = -0.5 * v * dt * dt
         F[HEADING, CURVATURE] = -v * dt
         F[HEADING, BIAS] = -dt
         turned = yaw_rate * dt
-    y = F @ x
+    y = np.zeros(N_ROAD)
+    for i in range(N_ROAD):
+        for j in range(N_ROAD):
+            y[i] += F[i, j] * x[j]
     y[HEADING] += turned
     y[OFFSET] += 0.5 * v * dt * turned
-    x[:] = y
-    P[:] = F @ P @ F.T
+    x[:N_ROAD] = y
+    P[:N_ROAD, :] = F @ P[:N_ROAD, :].copy()
+    P[:, :N_ROAD] = P[:, :N_ROAD].copy() @ F.T
     yaw = par[P_YAW_NOISE] if known else par[P_YAW_NOISE_UNKNOWN]
     P[HEADING, HEADING] += yaw**2 * dt
     P[OFFSET, OFFSET] += par[P_DRIFT] ** 2 * dt
-    if not known:
-        P[OFFSET, OFFSET] += (par[P_HEADING_STD] * v) ** 2 * dt
     P[CURVATURE, CURVATURE] += (
         par[P_CURVATURE_STD] ** 2 * (1.0 - F[CURVATURE, CURVATURE] ** 2) * 0.1
     )
     P[CHANGE, CHANGE] += par[P_CHANGE_STD] ** 2 * (1.0 - F[CHANGE, CHANGE] ** 2)
-    # The bias wanders by its own size in ten minutes.
+    # The error of the sensor wanders by its own size in ten minutes.
     P[BIAS, BIAS] += par[P_BIAS_STD] ** 2 * dt / 600.0
-    # A driver keeps to the lane and along it; slow, because he does so for a while at a time.
-    h = np.zeros(N_ROAD)
+    # A driver keeps to the lane and along it, for a while at a time; what the ego turns is mostly
+    # the road's bend.
+    h = np.zeros(N_ROAD + 1)
     h[HEADING] = 1.0
     r = par[P_HEADING_STD] ** 2 * max(par[P_HEADING_TIME] / dt, 1.0)
-    scalar_update_(x, P, h, 0.0, r, np.inf)
+    scalar_update_(x, P, h, FREE, 0.0, r, np.inf)
     h[HEADING] = 0.0
     h[OFFSET] = 1.0
     r = par[P_OFFSET_STD] ** 2 * max(par[P_OFFSET_TIME] / dt, 1.0)
-    scalar_update_(x, P, h, par[P_OFFSET], r, np.inf)
+    scalar_update_(x, P, h, FREE, par[P_OFFSET], r, np.inf)
+    if known:
+        turn_with_road_(x, P, par, speed, yaw_rate, max(par[P_TURN_TIME] / dt, 1.0))
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def lane_row_(h: FloatArray, x: float, lane: float) -> None:  # pragma: no cover - compiled
-    """Row h (7,) with h @ state = lateral position of the middle of a lane at distance x [m]."""
+def turn_with_road_(
+    x: FloatArray, P: FloatArray, par: FloatArray, speed: float, yaw_rate: float, weight: float
+) -> None:  # pragma: no cover - compiled
+    """The ego turns as the road does, with ``weight`` times the usual variance; in place."""
+    if speed == speed and yaw_rate == yaw_rate:
+        h = np.zeros(N_ROAD + 1)
+        h[BIAS] = 1.0
+        h[CURVATURE] = speed
+        scalar_update_(x, P, h, FREE, yaw_rate, par[P_TURN_STD] ** 2 * weight, np.inf)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def lane_row_(h: FloatArray, x: float) -> None:  # pragma: no cover - compiled
+    """Row h (>= 7,): h @ state is the lateral position of the ego's lane at distance x [m]."""
     far = min(max(x, 0.0), FAR)
     h[OFFSET] = -1.0
     h[HEADING] = -x
@@ -184,7 +230,7 @@ def lane_row_(h: FloatArray, x: float, lane: float) -> None:  # pragma: no cover
     h[CHANGE] = 0.5 * far * far * (x - far / 1.5)
     h[BIAS] = 0.0
     h[MOUNTING] = -x
-    h[WIDTH] = lane
+    h[WIDTH] = 0.0
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -202,7 +248,7 @@ def slope_row_(h: FloatArray, x: float) -> None:  # pragma: no cover - compiled
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def variance(P: FloatArray, h: FloatArray) -> float:  # pragma: no cover - compiled
-    """h P h'."""
+    """h P h' of the road's states."""
     v = 0.0
     for i in range(N_ROAD):
         for j in range(N_ROAD):
@@ -211,26 +257,31 @@ def variance(P: FloatArray, h: FloatArray) -> float:  # pragma: no cover - compi
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def value(x: FloatArray, h: FloatArray) -> float:  # pragma: no cover - compiled
+    """h x of the road's states."""
+    v = 0.0
+    for i in range(N_ROAD):
+        v += h[i] * x[i]
+    return v
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def place(
     road: FloatArray, h: FloatArray, x: float, vx: float, speed: float
 ) -> tuple[float, float]:  # pragma: no cover - compiled
-    """Lateral position and lateral speed against the ego of a vehicle that follows the ego's lane.
+    """Lateral position and speed against the ego of a vehicle that follows the ego's lane.
 
     Args:
-        road: (7,) state.  h: (7,) scratch.  x, vx: where it is ahead of the ego, and how much faster.
+        road: (31,) state.  h: (8,) scratch.
+        x, vx: where it is ahead of the ego [m], and how much faster [m/s].
         speed: of the ego [m/s], NaN where unknown.
     """
-    lane_row_(h, x, 0.0)
-    y = 0.0
-    for i in range(N_ROAD):
-        y += h[i] * road[i]
+    lane_row_(h, x)
+    y = value(road, h)
     vy = 0.0
     if speed == speed:
         slope_row_(h, x)
-        direction = 0.0
-        for i in range(N_ROAD):
-            direction += h[i] * road[i]
-        vy = (speed + vx) * direction + speed * road[MOUNTING]
+        vy = (speed + vx) * value(road, h) + speed * road[MOUNTING]
     return y, vy
 
 
@@ -248,33 +299,34 @@ def localise_(
 ) -> None:  # pragma: no cover - compiled
     """Measurements from the vehicle's axes to those of the road, in place.
 
-    In the road's axes y counts from the middle of the ego's lane at the same distance, and vy is the
-    speed across the lane.  The uncertainty of the road adds to the variances.
+    In the road's axes y counts from the middle of the ego's lane at the same distance, and vy is
+    the speed across the lane.  The uncertainty of the road adds to the variances.
 
     Args:
-        road: (7,).  P: (7, 7).  par: `PARAMETERS`.
+        road: (31,).  P: (31, 31).  par: `PARAMETERS`.
         n: rows in use.  z, r: (N, 4) values and variances.  valid: (N, 4).  angle: (N,) [rad].
         speed: of the ego [m/s], NaN where unknown.
     """
-    h = np.zeros(N_ROAD)
+    h = np.zeros(N_ROAD + 1)
     for k in range(n):
         if not valid[k, 0]:
             continue
         cos, sin = math.cos(angle[k]), math.sin(angle[k])
         x = z[k, 0] * cos - (z[k, 2] * sin if valid[k, 2] else 0.0)
         vx = z[k, 1] * cos if valid[k, 1] else 0.0
-        if not abs(x) < 1e4:
+        if not (abs(x) < 1e4 and abs(vx) < 1e4):
             continue
         y, vy = place(road, h, x, vx, speed)
-        lane_row_(h, x, 0.0)
-        error = variance(P, h) * par[P_ERROR_WEIGHT]
+        lane_row_(h, x)
+        error = min(par[P_ERROR_WEIGHT] * variance(P, h), par[P_ERROR_MOST] ** 2)
         z[k, 0] -= y * sin
         z[k, 2] -= y * cos
         r[k, 0] += error * sin * sin
         r[k, 2] += error * cos * cos
         if speed == speed:
             slope_row_(h, x)
-            error = variance(P, h) * par[P_ERROR_WEIGHT] * (speed + vx) ** 2
+            error = par[P_SPEED_ERROR_WEIGHT] * variance(P, h) * (speed + vx) ** 2
+            error = min(error, par[P_SPEED_ERROR_MOST] ** 2)
             z[k, 1] -= vy * sin
             z[k, 3] -= vy * cos
             r[k, 1] += error * sin * sin
@@ -282,10 +334,38 @@ def localise_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def free_guide_(P: FloatArray, x: FloatArray, g: int) -> None:  # pragma: no cover - compiled
+    """Forget guide g."""
+    a = N_ROAD + g
+    x[a] = 0.0
+    for i in range(N):
+        P[a, i] = 0.0
+        P[i, a] = 0.0
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def begin_guide_(
+    x: FloatArray, P: FloatArray, h: FloatArray, g: int, y: float, r: float
+) -> None:  # pragma: no cover - compiled
+    """Guide g is first seen at y: its place is y minus the lane's, and as uncertain as both."""
+    a = N_ROAD + g
+    x[a] = y - value(x, h)
+    for i in range(N):
+        v = 0.0
+        for j in range(N_ROAD):
+            v -= h[j] * P[j, i]
+        P[a, i] = v
+        P[i, a] = v
+    P[a, a] = variance(P, h) + r
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def watch_traffic_(
     road: FloatArray,
     P: FloatArray,
     par: FloatArray,
+    guide_slot: IntArray,
+    guide_unseen: FloatArray,
     bank: Any,
     objects: Any,
     n: int,
@@ -298,10 +378,12 @@ def watch_traffic_(
     angle: FloatArray,
     dt: float,
 ) -> int:  # pragma: no cover - compiled
-    """Update the road by the vehicles that keep to their lanes, in place.
+    """Update the road by the vehicles on it, in place.
 
     Args:
         road, P, par: as for `localise_`.
+        guide_slot: (24,) slot of each guide, `FREE` for none.
+        guide_unseen: (24,) for how long it was not measured [s].
         bank, objects: records of the mode bank and of the slots, after this scan's cycle.
         n: rows of the scan.  slot, status: (N,) as for `imm.process_scan_`.
         age: (capacity,) scans in which the slot's object was seen.
@@ -312,28 +394,71 @@ def watch_traffic_(
         By how many lanes the ego has moved to the left (+1, -1 or 0).  The road's offset and the
         objects' lateral positions have been changed accordingly.
     """
-    h = np.zeros(N_ROAD)
+    h = np.zeros(N_ROAD + 1)
     wander = par[P_WANDER_STD] ** 2 * max(par[P_WANDER_TIME] / dt, 1.0)
+    guide_of = np.full(objects.shape[0], FREE)
+    for g in range(N_GUIDES):
+        if guide_slot[g] == FREE:
+            continue
+        guide_unseen[g] += dt
+        if guide_unseen[g] > 1.0:
+            guide_slot[g] = FREE
+            free_guide_(P, road, g)
+        else:
+            guide_of[guide_slot[g]] = g
     for k in range(n):
         s = slot[k]
-        if s < 0 or status[k] != 0 or age[s] < 5 or not (valid[k, 0] and valid[k, 2]):
-            continue
-        obj = objects[s]
-        moving = 0.0
-        for j in range(bank[0].n_modes):
-            if bank[0].direction[j] != 0 or bank[0].off_lane[j] != 0:
-                moving += obj.mu[j]
-        width = road[WIDTH]
-        lane = math.floor(obj.mean[2] / width + 0.5)
-        if moving > 0.2 or abs(lane) > 6.0 or abs(obj.mean[2] - lane * width) > 0.3 * width:
+        if s < 0 or status[k] != 0 or not (valid[k, 0] and valid[k, 2]):
             continue
         cos, sin = math.cos(angle[k]), math.sin(angle[k])
         x = z[k, 0] * cos - z[k, 2] * sin
         y = z[k, 0] * sin + z[k, 2] * cos
-        if not 0.0 < x < FAR:
+        noise = r[k, 2] * cos * cos + r[k, 0] * sin * sin
+        moving = 0.0
+        off = 0.0
+        for j in range(bank[0].n_modes):
+            if bank[0].direction[j] != 0:
+                moving += objects[s].mu[j]
+            if bank[0].off_lane[j]:
+                off += objects[s].mu[j]
+        g = guide_of[s]
+        lane_row_(h, x)
+        if g == FREE or age[s] <= 1 or off > 0.5 or not 0.0 < x < SEEN_TO:
+            if g != FREE:
+                guide_slot[g] = FREE
+                free_guide_(P, road, g)
+            if off > 0.5 or not 0.0 < x < SEEN_TO:
+                continue
+            if g == FREE:
+                for other in range(N_GUIDES):
+                    if guide_slot[other] == FREE:
+                        g = other
+                        break
+            if g != FREE:
+                guide_slot[g] = s
+                guide_unseen[g] = 0.0
+                begin_guide_(road, P, h, g, y, noise)
             continue
-        lane_row_(h, x, lane)
-        scalar_update_(road, P, h, y, wander + r[k, 2] * cos * cos + r[k, 0] * sin * sin, 9.0)
+        guide_unseen[g] = 0.0
+        a = N_ROAD + g
+        free = par[P_FREEDOM] * (1.0 - moving) + par[P_FREEDOM_CHANGING] * moving
+        P[a, a] += free * free * dt
+        h[N_ROAD] = 1.0
+        if not scalar_update_(road, P, h, g, y, noise, GATE):
+            free_guide_(P, road, g)
+            h[N_ROAD] = 0.0
+            begin_guide_(road, P, h, g, y, noise)
+            continue
+        # In the long run vehicles drive where the lanes are; but not those between them.
+        lane = math.floor(road[a] / road[WIDTH] + 0.5)
+        between = 2.0 * (road[a] / road[WIDTH] - lane)
+        if moving > 0.5 or abs(lane) > 6.0 or abs(between) > 0.8:
+            continue
+        for i in range(N_ROAD):
+            h[i] = 0.0
+        h[WIDTH] = -lane
+        doubt = 1.0 + 5.0 * (moving + between**4)
+        scalar_update_(road, P, h, g, 0.0, doubt * wander, np.inf)
     moved = 0
     if road[OFFSET] > 0.5 * road[WIDTH]:
         moved = 1
@@ -342,6 +467,9 @@ def watch_traffic_(
     if moved != 0:
         shift = moved * road[WIDTH]
         road[OFFSET] -= shift
+        for g in range(N_GUIDES):
+            if guide_slot[g] != FREE:
+                road[N_ROAD + g] -= shift
         for s in range(objects.shape[0]):
             objects[s].mean[2] -= shift
             for j in range(bank[0].n_modes):

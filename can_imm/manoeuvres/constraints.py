@@ -41,7 +41,8 @@ def fill_soft(record: Any, j: int, mode: Table, states: Sequence[str], lanes: La
         kind, span = _lane(row, states[s], lanes)
         record["soft_state"][j, c] = s
         record["soft_kind"][j, c], record["soft_lanes"][j, c] = kind, span
-        record["soft_r"][j, c] = row.number("r", above=0.0)
+        record["soft_density"][j, c] = dense = "density" in row
+        record["soft_r"][j, c] = row.number("density" if dense else "r", above=0.0)
         record["soft_value"][j, c] = row.number("value", None if kind == FIXED else 0.0)
         row.done()
 

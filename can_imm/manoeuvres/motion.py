@@ -50,10 +50,18 @@ def _equation_33(table: Table, n: int, dt: float) -> Matrices:
     return F, Q
 
 
-def _discrete_cv(table: Table, q: float, n: int, dt: float) -> Matrices:
+def _damped(table: Table, n: int, dt: float) -> Matrices:
+    """A speed that forgets itself in tau, as of a vehicle that wanders about in its lane."""
+    tau = table.number("tau_s", low=0.01)
+    sigma = table.number("speed_std", low=0.0)
+    return _discrete_cv(table, 2.0 * sigma**2 / tau, n, dt, 1.0 / tau)
+
+
+def _discrete_cv(table: Table, q: float, n: int, dt: float, damping: float = 0.0) -> Matrices:
     A = np.zeros((n, n))
     W = np.zeros((n, n))
     A[0, 1] = 1.0
+    A[1, 1] = -damping
     W[1, 1] = q
     if n == 3:
         # no acceleration in this model: the state decays at once and keeps its prior spread
@@ -80,6 +88,7 @@ def _singer(table: Table, n: int, dt: float) -> Matrices:
 
 _MODELS: dict[str, Callable[[Table, int, float], Matrices]] = {
     "constant-velocity": _constant_velocity,
+    "damped": _damped,
     "singer": _singer,
     "equation-33": _equation_33,
 }

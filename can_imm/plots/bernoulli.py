@@ -1,4 +1,4 @@
-"""Figures of the Bernoulli study, as PNG files; made like those of `can_imm.plots`."""
+"""Figures of the Bernoulli study, as PNG files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from can_imm.plots_style import STYLE, save
+from can_imm.plots.style import STYLE, save
 from can_imm.types import FloatArray
 
 COLOURS = {"bernoulli-product": "#0072b2", "bernoulli-union": "#d55e00", "ekf": "#555555"}

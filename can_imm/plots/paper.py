@@ -1,17 +1,12 @@
-"""Figures 3 to 8 of the paper and the study's comparisons, as PNG files.
-
-Only the plots modules import matplotlib; import them only where a figure was asked for.  Figures
-are built without pyplot, so there is no display, no backend and no global state.  Every function
-takes plain arrays, writes one file and returns its path.
-"""
+"""Figures 3 to 8 of the paper and the study's comparisons."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -19,31 +14,14 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from can_imm.plots_style import STYLE as _STYLE
-from can_imm.plots_style import save as _save
+from can_imm.plots.style import BAR, COLOURS, STYLE, manoeuvre_name, save
 from can_imm.types import VX, FloatArray, Manoeuvre, X
 
 Int8Array = npt.NDArray[np.int8]
 
-COLOURS = {
-    Manoeuvre.UNKNOWN: "#c8c8c8",
-    Manoeuvre.KEEP_RIGHT: "#0072b2",
-    Manoeuvre.LANE_CHANGE: "#e69f00",
-    Manoeuvre.KEEP_LEFT: "#56b4e9",
-    Manoeuvre.OVERTAKING: "#009e73",
-    Manoeuvre.RECEDING: "#cc79a7",
-    Manoeuvre.APPROACHING: "#f0e442",
-    Manoeuvre.REAR_END: "#d55e00",
-}
-"""One colour per manoeuvre in every figure (Okabe and Ito, told apart by the colour-blind)."""
-
 MANOEUVRES = tuple(Manoeuvre(value) for value in range(1, 8))
 STATES = (("x", "m"), ("vx", "m/s"), ("y", "m"), ("vy", "m/s"))
-_TRUE, _FILTERED, _MEASURED, _BAR = "#000000", "#0072b2", "#9a9a9a", "#6f8fb0"
-
-
-def _name(manoeuvre: int) -> str:
-    return Manoeuvre(manoeuvre).name.replace("_", " ").lower()
+_TRUE, _FILTERED, _MEASURED = "#000000", "#0072b2", "#9a9a9a"
 
 
 def _axis_label(name: str, unit: str) -> str:
@@ -65,7 +43,10 @@ def _shade(axes: Any, t_s: FloatArray, labels: Int8Array) -> None:
 def _manoeuvre_legend(figure: Figure, labels: Int8Array, alpha: float = 1.0) -> None:
     shown = [Manoeuvre(v) for v in np.unique(labels)]
     figure.legend(
-        handles=[Patch(color=COLOURS[m], alpha=alpha, linewidth=0, label=_name(m)) for m in shown],
+        handles=[
+            Patch(color=COLOURS[m], alpha=alpha, linewidth=0, label=manoeuvre_name(m))
+            for m in shown
+        ],
         loc="outside lower center",
         ncols=len(shown),
         fontsize=8,
@@ -74,7 +55,7 @@ def _manoeuvre_legend(figure: Figure, labels: Int8Array, alpha: float = 1.0) -> 
     )
 
 
-@mpl.rc_context(_STYLE)
+@mpl.rc_context(STYLE)
 def controls(
     directory: Path,
     t_s: FloatArray,
@@ -99,10 +80,10 @@ def controls(
     rows[-1].set_xlim(t_s[0], t_s[-1])
     figure.align_ylabels()
     _manoeuvre_legend(figure, labels, alpha=0.35)
-    return _save(figure, directory, "fig3_controls")
+    return save(figure, directory, "fig3_controls")
 
 
-@mpl.rc_context(_STYLE)
+@mpl.rc_context(STYLE)
 def overtaking_profile(
     directory: Path, labels: Int8Array, state: FloatArray, corners: FloatArray
 ) -> Path:
@@ -138,10 +119,10 @@ def overtaking_profile(
     axes.set_ylabel("relative speed $v_x$ [m/s]")
     axes.set_ylim(bottom=0)
     axes.legend(loc="lower center")
-    return _save(figure, directory, "fig4_overtaking_profile")
+    return save(figure, directory, "fig4_overtaking_profile")
 
 
-@mpl.rc_context(_STYLE)
+@mpl.rc_context(STYLE)
 def mode_probabilities(directory: Path, t_s: FloatArray, labels: Int8Array, p: FloatArray) -> Path:
     """Fig. 5: probability of every manoeuvre over time; ``p`` (N, 8) by `Manoeuvre` value."""
     figure = Figure(figsize=(8, 6), layout="constrained")
@@ -155,14 +136,14 @@ def mode_probabilities(directory: Path, t_s: FloatArray, labels: Int8Array, p: F
         axes.set_ylim(0, 1.05)
         axes.set_yticks([0, 1])
         axes.grid(visible=False)
-        axes.set_ylabel(_name(manoeuvre), rotation=0, ha="right", va="center")
+        axes.set_ylabel(manoeuvre_name(manoeuvre), rotation=0, ha="right", va="center")
     rows[0].set_title("Probability of each manoeuvre; grey: when it is true")
     rows[-1].set_xlabel("time [s]")
     rows[-1].set_xlim(t_s[0], t_s[-1])
-    return _save(figure, directory, "fig5_mode_probabilities")
+    return save(figure, directory, "fig5_mode_probabilities")
 
 
-@mpl.rc_context(_STYLE)
+@mpl.rc_context(STYLE)
 def manoeuvre_bands(directory: Path, t_s: FloatArray, labels: Int8Array, said: Int8Array) -> Path:
     """Fig. 6: true and detected manoeuvres over time as bands of colour, both (N,)."""
     figure = Figure(figsize=(8, 2.4), layout="constrained")
@@ -185,10 +166,10 @@ def manoeuvre_bands(directory: Path, t_s: FloatArray, labels: Int8Array, said: I
     axes.set_xlim(t_s[0], t_s[-1])
     axes.set_title("Manoeuvres")
     _manoeuvre_legend(figure, np.concatenate((labels, said)))
-    return _save(figure, directory, "fig6_manoeuvres")
+    return save(figure, directory, "fig6_manoeuvres")
 
 
-@mpl.rc_context(_STYLE)
+@mpl.rc_context(STYLE)
 def states(
     directory: Path, t_s: FloatArray, state: FloatArray, z: FloatArray, x: FloatArray
 ) -> Path:
@@ -206,10 +187,10 @@ def states(
     figure.align_ylabels()
     handles, names = rows[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=3, markerscale=3)
-    return _save(figure, directory, "fig7_states")
+    return save(figure, directory, "fig7_states")
 
 
-@mpl.rc_context(_STYLE)
+@mpl.rc_context(STYLE)
 def errors(
     directory: Path, t_s: FloatArray, state: FloatArray, x: FloatArray, cov: FloatArray
 ) -> Path:
@@ -232,7 +213,7 @@ def errors(
     figure.align_ylabels()
     handles, names = rows[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=2)
-    return _save(figure, directory, "fig8_errors")
+    return save(figure, directory, "fig8_errors")
 
 
 @dataclass(frozen=True)
@@ -267,7 +248,7 @@ def paper_figures(directory: Path, run: Run, corners: FloatArray) -> list[Path]:
     ]
 
 
-@mpl.rc_context(_STYLE)
+@mpl.rc_context(STYLE)
 def confusion(directory: Path, name: str, title: str, counts: npt.NDArray[np.int64]) -> Path:
     """Confusion in percent of each true class; ``counts`` (8, 8), rows true, columns said."""
     rows = [m for m in Manoeuvre if counts[m].any()]
@@ -281,16 +262,18 @@ def confusion(directory: Path, name: str, title: str, counts: npt.NDArray[np.int
         if part[i, j]:
             colour = "white" if value > 55 else "black"
             axes.text(j, i, f"{value:.1f}", ha="center", va="center", color=colour, fontsize=8)
-    axes.set_xticks(range(len(columns)), [_name(m) for m in columns], rotation=35, ha="right")
-    axes.set_yticks(range(len(rows)), [_name(m) for m in rows])
+    axes.set_xticks(
+        range(len(columns)), [manoeuvre_name(m) for m in columns], rotation=35, ha="right"
+    )
+    axes.set_yticks(range(len(rows)), [manoeuvre_name(m) for m in rows])
     axes.grid(visible=False)
     axes.set_xlabel("detected")
     axes.set_ylabel("true")
     axes.set_title(title)
-    return _save(figure, directory, name)
+    return save(figure, directory, name)
 
 
-@mpl.rc_context(_STYLE)
+@mpl.rc_context(STYLE)
 def comparison(
     directory: Path,
     name: str,
@@ -314,7 +297,7 @@ def comparison(
             where[known],
             value[known],
             xerr=2 * np.nan_to_num(error[known]),
-            color=_BAR,
+            color=BAR,
             error_kw={"elinewidth": 0.8, "capsize": 2},
         )
         axes.set_title(what, fontsize=9)
@@ -330,35 +313,4 @@ def comparison(
             )
         axes.margins(x=0.28)
     figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-    return _save(figure, directory, name)
-
-
-class Distribution(Protocol):
-    """A histogram of durations, as `can_imm.runtime.latency.Histogram`."""
-
-    counts: list[int]
-    n: int
-
-    def edge_ns(self, i: int) -> float:
-        """Lower edge of bin ``i`` [ns]."""
-
-
-def latency_figure(path: Path, stages: Mapping[str, Distribution]) -> Path:
-    """Distributions of durations over a logarithmic axis, one row per stage."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(7.0, 0.6 * len(stages) + 1.0))
-        axes = figure.subplots(len(stages), 1, sharex=True, squeeze=False)[:, 0]
-        for ax, (name, stage) in zip(axes, stages.items(), strict=True):
-            # four bins of 1 % to one that can be seen
-            counts = [sum(stage.counts[i : i + 4]) for i in range(0, len(stage.counts), 4)]
-            edges = [stage.edge_ns(4 * i) / 1e3 for i in range(len(counts) + 1)]
-            share = [100.0 * count / max(stage.n, 1) for count in counts]
-            ax.stairs(share, edges, fill=True, color=_BAR)
-            ax.set_xscale("log")
-            ax.set_xlim(1.0, 1e5)
-            ax.set_yticks([])
-            ax.set_ylabel(name.replace("_", " "), rotation=0, ha="right", va="center")
-        axes[-1].set_xlabel("duration [us]")
-        figure.tight_layout()
-        figure.savefig(path)
-    return path
+    return save(figure, directory, name)

@@ -1,4 +1,4 @@
-"""Figures of the roadside study, as PNG files; made like those of `can_imm.plots`."""
+"""Figures of the roadside study, as PNG files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Wedge
 
-from can_imm.plots_style import STYLE, save
+from can_imm.plots.style import STYLE, save
 from can_imm.types import BoolArray, FloatArray, X, Y
 
 COLOURS = {"cv-strawman": "#d55e00", "cv-tuned": "#e69f00", "imm-ukf": "#0072b2"}

@@ -17,7 +17,7 @@ from can_imm.types import DetectionScan, Scan
 if TYPE_CHECKING:
     from can_imm.bus.decoder import ScanDecoder
     from can_imm.detector import Detector
-    from can_imm.sim.player import Player
+    from can_imm.sim.player import Player, Timed
 
 SENSOR_TIMEOUT_NS = 1_000_000_000
 """After so long without a scan [ns] the heartbeat says that there is no sensor."""
@@ -29,6 +29,7 @@ REHEARSED = 4
 """So many frames of a step are rehearsed."""
 
 S = TypeVar("S", Scan, DetectionScan)
+T = TypeVar("T", bound="Timed")
 S_contra = TypeVar("S_contra", contravariant=True)
 
 Reports = npt.NDArray[Any]
@@ -82,12 +83,12 @@ class ScanEncoder(Protocol[S_contra]):
         """Frames of ``scan``, stamped ``t_ns`` [ns]."""
 
 
-class SenderNode(Generic[S]):
+class SenderNode(Generic[T]):
     """Sends the scans of a player as frames, when they are due."""
 
-    def __init__(self, player: Player[S], encoder: ScanEncoder[S]) -> None:
-        self._player: Player[S] = player
-        self._encoder: ScanEncoder[S] = encoder
+    def __init__(self, player: Player[T], encoder: ScanEncoder[T]) -> None:
+        self._player: Player[T] = player
+        self._encoder: ScanEncoder[T] = encoder
 
     def step(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
         scan = self._player.step(t_ns)

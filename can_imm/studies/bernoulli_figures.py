@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from can_imm import plots_bernoulli as plots
+from can_imm.plots import bernoulli as plots
 from can_imm.studies.bernoulli import (
     BINS,
     PRODUCT,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from can_imm import plots
+from can_imm.plots import paper as plots
 from can_imm.studies.metrics import summarise
 from can_imm.studies.paper import TABLE_6, Result
 from can_imm.studies.runs import Observation, play

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from can_imm import plots_roadside as plots
+from can_imm.plots import roadside as plots
 from can_imm.studies.roadside import (
     DETECTED,
     ERRORS,

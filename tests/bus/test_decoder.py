@@ -17,7 +17,7 @@ from can_imm.bus.profile import load_profile
 PROFILE = load_profile("can_imm")
 FATES = (
     "unknown", "bad_kind", "bad_length", "bad_crc", "bad_counter", "out_of_range", "stray",
-    "duplicates", "overflow", "empty", "used",
+    "duplicates", "overflow", "empty", "used", "ego", "other_sensor",
 )  # fmt: skip
 
 
@@ -66,10 +66,14 @@ def test_a_whole_scan_in_si_units(bench, radar):
     assert scan.new[:2].tolist() == [True, False]
     expected = [[50.0, -0.98, 1.0, 0.35], [-3.5, -0.98, -2.0, -1.4]]
     np.testing.assert_allclose(scan.z[:2], expected, atol=1e-12)
-    np.testing.assert_array_equal(scan.std[:2], [[0.1, 0.3, 0.2, 0.3]] * 2)
+    steps = np.array([0.02, 0.07, 0.05, 0.07])
+    std = np.sqrt(np.array([0.1, 0.3, 0.2, 0.3]) ** 2 + steps**2 / 12)
+    np.testing.assert_allclose(scan.std[:2], [std] * 2)
+    assert not scan.angle[:2].any()
+    assert (scan.existence[:2] == 1).all()
     assert scan.valid[:2].all()
     assert bench.counts.used == bench.counts.checksums_ok == 3
-    assert bench.decoder.ids == {0x300, 0x301}
+    assert bench.decoder.ids == {0x300, 0x301, 0x302}
 
 
 def test_latency_sign_and_offset_of_a_profile(tmp_path, radar):
@@ -82,7 +86,7 @@ def test_latency_sign_and_offset_of_a_profile(tmp_path, radar):
     scan = decoder.feed(Frame(101 * MS, *radar.object(1, DistLat=2.0)))
     assert scan.t_ns == 87_500_000
     assert scan.z[0, 2] == pytest.approx(-1.5)
-    assert scan.std[0].tolist() == [0.1, 0.3, 0.4, 0.3]
+    np.testing.assert_allclose(scan.std[0], [0.1, 0.3, 0.4, 0.3], rtol=0.005)
 
 
 def test_an_empty_scan_is_a_scan(bench, radar):
@@ -165,7 +169,7 @@ def test_frames_of_another_kind(bench, radar, flags):
 
 
 def test_unknown_ids_are_ignored(bench, radar):
-    bench.feed(radar.scan(1), (0x302, bytes(8)), (0x310, bytes(8)), radar.object(4))
+    bench.feed(radar.scan(1), (0x303, bytes(8)), (0x310, bytes(8)), radar.object(4))
     assert bench.scans == [(0, [4], False)]
     assert bench.counts.unknown == 2
 

@@ -19,7 +19,7 @@ from can_imm.bus.encoder import (
 from can_imm.bus.frame import REMOTE
 from can_imm.bus.listener import EstimateMessage, ManoeuvreDecoder
 from can_imm.bus.profile import load_profile
-from can_imm.types import REPORT_DTYPE, Manoeuvre, Scan
+from can_imm.types import CUT_IN, CUT_OUT, OVERTAKING_ANOTHER, REPORT_DTYPE, Manoeuvre, Scan
 
 NAN = float("nan")
 
@@ -108,7 +108,7 @@ def test_a_scan_comes_back_within_half_a_step(rows):
 
 def test_manoeuvre_frames(own_db):
     encoder = ManoeuvreEncoder()
-    odd = report_of(object_id=126, lane=-1, coasting=True, age=9999)
+    odd = report_of(object_id=254, lane=-9, coasting=True, age=9999, flags=CUT_IN)
     reports = np.concatenate([report_of(), odd])
     frames = [frame for k in range(20) for frame in encoder.encode(reports, k * 10 * MS)]
     check_protection(frames)
@@ -117,24 +117,24 @@ def test_manoeuvre_frames(own_db):
     del state["Crc"], state["AliveCounter"]
     assert state == {
         "ObjectId": 5, "Coasting": "Seen", "Manoeuvre": "LANE_CHANGE",
-        "SecondManoeuvre": "KEEP_LEFT", "Direction": "Right", "Lane": "Left",
+        "SecondManoeuvre": "KEEP_LEFT", "Direction": "Right", "Lane": 1, "Event": "None",
         "Probability": pytest.approx(81.3), "SecondProbability": pytest.approx(10.0),
         "TrackAge": 17,
     }  # fmt: skip
     assert estimate["ObjectId"] == 5
     for name, value in zip(
-        ("DistLong", "VrelLong", "DistLat", "VrelLat"), (51.24, -1.52, 1.44, 0.75), strict=True
+        ("DistLong", "VrelLong", "DistLat", "VrelLat"), (51.24, -1.5, 1.44, 0.75), strict=True
     ):
         assert estimate[name] == pytest.approx(value)
     assert (other["ObjectId"], other["Lane"], other["Coasting"]) == (
-        126,
+        254,
         "NotAvailable",
         "Coasting",
     )
-    assert other["TrackAge"] == 4095
+    assert (other["TrackAge"], other["Event"]) == (1023, "CUT_IN")
 
 
-@pytest.mark.parametrize("object_id", [-1, 127, 530])
+@pytest.mark.parametrize("object_id", [-1, 255, 530])
 def test_a_report_whose_id_does_not_fit_is_left_out(object_id):
     encoder = ManoeuvreEncoder()
     assert encoder.encode(report_of(object_id=object_id), 0) == []
@@ -174,9 +174,10 @@ def test_output_ids_are_what_the_detector_sends(own_db):
 
 @given(
     manoeuvre=st.sampled_from(Manoeuvre), second=st.sampled_from(Manoeuvre),
-    direction=st.sampled_from([-1, 0, 1]), lane=st.sampled_from([-1, 0, 1]),
-    probability=st.floats(0, 1), age=st.integers(0, 4095), coasting=st.booleans(),
-    x=st.tuples(st.floats(-75, 250), st.floats(-81, 81), st.floats(-20.4, 20.4),
+    direction=st.sampled_from([-1, 0, 1]), lane=st.integers(-7, 7),
+    flags=st.sampled_from([0, CUT_IN, CUT_OUT, OVERTAKING_ANOTHER]),
+    probability=st.floats(0, 1), age=st.integers(0, 1023), coasting=st.booleans(),
+    x=st.tuples(st.floats(-75, 250), st.floats(-76.7, 76.7), st.floats(-20.4, 20.4),
                 st.floats(-6.3, 6.3)),
 )  # fmt: skip
 def test_the_listener_reads_back_what_was_said(x, probability, **values):
@@ -188,7 +189,7 @@ def test_the_listener_reads_back_what_was_said(x, probability, **values):
         assert getattr(state, name) == value
     assert state.probability == pytest.approx(probability, abs=0.0005001)
     assert estimate.object_id == 5
-    assert (abs(np.array(estimate[1:]) - x) <= np.array([0.01, 0.02, 0.01, 0.025]) + 1e-9).all()
+    assert (abs(np.array(estimate[1:]) - x) <= np.array([0.01, 0.0375, 0.01, 0.025]) + 1e-9).all()
 
 
 def test_the_listener_rejects_what_is_broken():

@@ -10,8 +10,10 @@ from can_imm.types import CanImmError
 
 
 def test_built_in_profiles():
-    assert builtin_profiles() == ["can_imm", "toyota", "tracking"]
-    own, toyota, _ = map(load_profile, builtin_profiles())
+    names = ["ars408", "can_imm", "esr", "toyota", "toyota-tss2", "tracking"]
+    assert builtin_profiles() == names
+    assert [load_profile(name).name for name in names] == names
+    own, toyota = load_profile("can_imm"), load_profile("toyota")
     assert (own.name, own.period_ns, own.dbc.name) == ("can_imm", 100_000_000, "can_imm.dbc")
     assert own.header is not None
     assert [c.std for c in own.state] == [0.1, 0.3, 0.2, 0.3]
@@ -42,7 +44,7 @@ BAD = [
     ('counter = "ScanCounter"', 'counter = "Cycle"', "no signal 'Cycle' in message RadarScan"),
     ('["RadarObject"]', "[]", "object: 'messages' must name at least one"),
     ('["RadarObject"]', '["RadarObject", "0x301"]', "object: 'messages' must name"),
-    ('["RadarObject"]', '["0x301-0x302"]', "object: 'messages': no message with id 0x302"),
+    ('["RadarObject"]', '["0x301-0x303"]', "object: 'messages': no message with id 0x303"),
     ('["RadarObject"]', '["Object"]', "object: no message 'Object' in"),
     ('id = "ObjectId"', 'id = "Number"', "no signal 'Number' in message RadarObject"),
     ('id = "ObjectId"', "", "object: 'id' is needed with"),
@@ -73,6 +75,53 @@ def test_a_bad_profile_is_refused_in_one_line(tmp_path, old, new, reason):
         load_profile(str(path))
     assert reason in str(caught.value)
     assert str(tmp_path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+BAD_NEW = [
+    ("ars408", "number = 8", "number = 0", "sensors: 'number' must be a whole number from 1"),
+    ("ars408", "number = 8", "number = 8\nuse = 8", "sensors: 'use' must be a whole number from 0"),
+    ("ars408", "new_codes = [1, 5]", "new_codes = [1.5]", "'new_codes' must be a list of whole"),
+    ("ars408", "any_of = [2, 1, 3, 5]", "any_of = []", "'any_of' must be a list of numbers"),
+    ("ars408", "any_of = [2, 1, 3, 5]", "any_of = [2], above = 1", "either 'equals' or 'below'"),
+    ("ars408", "at_least = 0.5", "at_least = 2", "existence: 'at_least' must be a number from 0"),
+    ("ars408", "Obj_DistLong_rms", "Obj_Dist_rms", "no signal 'Obj_Dist_rms' in message"),
+    ("ars408", "Obj_ProbOfExist", "Obj_Prob", "no signal 'Obj_Prob' in message"),
+    ("ars408", '"Obj_2_Quality", ', '"Obj_1_General", ', "two messages with one id"),
+    ("ars408", "Obj_VrelLat_rms\", std_codes = \"rms\"", "Obj_VrelLat_rms\", std_codes = \"r\"",
+     "vy: 'std_codes' must be one of rms, not 'r'"),
+    ("ars408", "rms = [", "rms = [[],", "codes: 'rms' must be a list of numbers"),
+    ("ars408", "at_least = 0.5", "at_least = 0.5\ncode = 3", "existence: unknown key 'code'"),
+    ("toyota", "below = 255.0", "below = inf", "valid_if 2: 'below' must be a number from"),
+    ("ars408", "id_step = 0x10", "id_step = 1", "two messages with one id"),
+    ("ars408", 'std_signal = "Obj_VrelLat_rms",', "", "vy: unknown key 'std_codes'"),
+    ("ars408", 'message = "SpeedInformation"', 'message = "Speed"', "ego, speed: no message"),
+    ("ars408", '"RadarDevice_YawRate"', '"YawRate"', "no signal 'YawRate' in message"),
+    ("ars408", "timeout_ms = 500", "", "ego: 'timeout_ms' is missing"),
+    ("ars408", "equals = 2 }", "equal = 2 }", "ego, speed, reverse_if: unknown key 'equal'"),
+    ("ars408", 'signal = "Obj_DistLong"', 'signal = "Obj_VrelLong"', "is in m/s by the DBC"),
+    ("esr", "bearing =", "angle =", "object, polar: unknown key 'angle'"),
+    ("esr", "range =", "rage =", "object, polar: unknown key 'rage'"),
+    ("esr", "[object.polar]", "[object.state]", "object, state: unknown key 'range'"),
+    ("esr", "std = 0.5 }", 'std = 0.5, unit = "m" }', "bearing: 'unit' must be one of rad, deg"),
+    ("esr", "[protection]", "[sensors]\nnumber = 2\nid_step = 64\n[protection]", "scan header"),
+    ("esr", "[protection]", "[mounting]\nz = 2\n[protection]", "mounting: unknown key 'z'"),
+    ("toyota", 'mean_of = ["WHEEL', 'mean_of = ["WEEL', "no signal 'WEEL_SPEED_FR' in message"),
+    ("can_imm", 'protection = "e2e-p01" }\nyaw', 'protection = "none" }\nyaw', "one protection"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "old", "new", "reason"), BAD_NEW)
+def test_bad_parts_of_other_profiles_are_refused_in_one_line(tmp_path, name, old, new, reason):
+    text = (ROOT / "dbc" / f"{name}.toml").read_text()
+    comments, rest = text.split("\ndescription = ", 1)
+    assert old in rest
+    path = tmp_path / f"{name}.toml"
+    path.write_text(comments + "\ndescription = " + rest.replace(old, new, 1))
+    shutil.copy(ROOT / "dbc" / f"{name}.dbc", tmp_path)
+    with pytest.raises(CanImmError) as caught:
+        load_profile(str(path))
+    assert reason in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

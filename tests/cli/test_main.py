@@ -74,7 +74,7 @@ def test_completion_script_knows_the_options(can_imm, shell):
 
 def test_only_the_chosen_command_is_loaded():
     parser = build_parser(["replay"])
-    assert parser.parse_args(["replay", "x.log"]).log == "x.log"
+    assert parser.parse_args(["replay", "x.log"]).logs == ["x.log"]
     assert not hasattr(parser.parse_args(["simulate"]), "scenario")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import re
 import time
 from pathlib import Path
@@ -73,7 +74,14 @@ def test_summary(can_imm, log):
     assert "61 complete, 0 incomplete" in lines["scans"]
     assert "1 seen" in lines["objects"]
     assert "0 bad" in lines["lines"]
-    changes = re.findall(r"^ +([\d.]+) +([\d.]+) +3  left$", out, re.MULTILINE)
+    assert lines["manoeuvres"].startswith("  manoeuvres 1 object; of their time: ")
+    shares = [float(x) for x in re.findall(r"([\d.]+) %", lines["manoeuvres"])]
+    assert sum(shares) == pytest.approx(100, abs=0.3)
+    changes = re.findall(
+        r"^ +([\d.]+) +([\d.]+) +3  lane change left +0 to 1 +[\d.]+ +40\.\d +39\.\d",
+        out,
+        re.MULTILINE,
+    )
     assert len(changes) == 1
     assert 2.0 <= float(changes[0][0]) <= 3.0
     assert 3.0 <= float(changes[0][1]) <= 4.6
@@ -146,6 +154,13 @@ def test_realtime_takes_as_long_as_the_log(can_imm, log, tmp_path):
         (["{log}", "--out", "/no/such/dir/x.log"], "/no/such/dir/x.log"),
         (["{log}", "--out", "x.nope"], "x.nope"),
         (["{log}", "--out", "{log}"], "this is the log that is read"),
+        (["{log}", "--events", "x.xml"], "x.xml"),
+        (["{log}", "--events", "/no/such/dir/x.csv"], "/no/such/dir/x.csv"),
+        (["{log}", "--plot", "/no/such/dir/x.png"], "/no/such/dir/x.png"),
+        (["{log}", "--plot", "x.gif"], "x.gif"),
+        (["{log}", "--sensor", "3"], "not 3"),
+        (["{log}", "--lag", "-1"], "-1"),
+        (["{log}", "--lag", "nan"], "nan"),
     ],
 )
 def test_refusals_are_one_line(can_imm, log, arguments, named):
@@ -191,14 +206,115 @@ def test_the_lane_change_on_a_real_road(can_imm, tmp_path):
     changes = [
         [float(x) - began for x in line.split()[:2]]
         for line in out.splitlines()
-        if line.split()[2:] == ["2", "right"]
+        if line.split()[2:6] == ["2", "lane", "change", "right"]
     ]
-    middle = [sum(change) / 2 for change in changes if 4.0 < change[0] < 11.0]
+    middle = [sum(change) / 2 for change in changes if 4.0 < change[0] < 9.0]
     assert len(middle) == 1
     assert middle[0] == pytest.approx(7.5, abs=1.0)
     rows = [row for row in rows_of(path.read_text()) if row["object_id"] == "2"]
     said = [row for row in rows if 5.5 < float(row["time_s"]) - began < 11.0]
     assert {row["direction"] for row in said if row["manoeuvre"] == "LANE_CHANGE"} == {"right"}
+
+
+def test_events_go_to_a_file(can_imm, log, tmp_path):
+    path = tmp_path / "events.csv"
+    assert can_imm("replay", log, "--events", path)[0] == 0
+    rows = rows_of(path.read_text())
+    changes = [row for row in rows if row["manoeuvre"] == "LANE_CHANGE"]
+    assert {row["log"] for row in rows} == {str(log)}
+    assert [(row["object_id"], row["direction"]) for row in changes] == [("3", "left")]
+    assert (changes[0]["lane_from"], changes[0]["lane_to"]) == ("0", "1")
+    assert float(changes[0]["gap_m"]) == pytest.approx(40, abs=0.5)
+    assert float(changes[0]["mean_probability"]) > 0.5
+
+
+def test_a_picture(can_imm, log, tmp_path):
+    path = tmp_path / "drive.png"
+    assert can_imm("replay", log, "--plot", path)[0] == 0
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_several_logs_are_as_many_recordings(can_imm, log, tmp_path):
+    """Each is answered as if it were alone: the second does not see the first one's tracks."""
+    alone, both, events = (tmp_path / name for name in ("alone.csv", "both.csv", "events.json"))
+    other = tmp_path / "other.log"
+    other.write_text("".join(log.read_text().splitlines(keepends=True)[60:]))
+    expected = []
+    for path in (log, other):
+        assert can_imm("replay", path, "--csv", alone)[0] == 0
+        expected += [f"{line},{path}" for line in alone.read_text().splitlines()[1:]]
+    status, out, err = can_imm("replay", log, other, "--csv", both, "--events", events)
+    assert (status, err) == (0, "")
+    lines = both.read_text().splitlines()
+    assert lines[0] == f"{COLUMNS},log"
+    assert lines[1:] == expected
+    assert [part["log"] for part in json.loads(events.read_text())] == [str(log), str(other)]
+    assert out.index(str(log)) < out.index(str(other))
+
+
+def test_a_broken_log_does_not_stop_the_others(can_imm, log, tmp_path):
+    empty, path = tmp_path / "empty.log", tmp_path / "both.csv"
+    empty.write_text("")
+    status, out, err = can_imm("replay", tmp_path / "missing.log", empty, log, "--csv", path)
+    assert status == 1
+    errors = err.splitlines()
+    assert len(errors) == 2
+    assert all(line.startswith("can-imm: error: ") for line in errors)
+    assert "missing.log" in errors[0]
+    assert "empty.log" in errors[1]
+    assert "61 complete" in out
+    assert len(rows_of(path.read_text())) == 61
+
+
+def test_pictures_of_several_logs_go_to_a_directory(can_imm, log, tmp_path):
+    other = tmp_path / "other.log"
+    other.write_text(log.read_text())
+    assert can_imm("replay", log, other, "--plot", tmp_path)[0] == 0
+    assert {path.name for path in tmp_path.glob("*.png")} == {"sensor.log.png", "other.log.png"}
+
+
+@pytest.mark.parametrize(
+    ("option", "why"),
+    [("--out", "--out takes one log, not 2"), ("--plot", "this must be a directory")],
+)
+def test_what_takes_one_log_is_refused_with_several(can_imm, log, tmp_path, option, why):
+    path = tmp_path / "x.png"
+    status, out, err = can_imm("replay", log, log, option, path)
+    assert status == 2
+    assert out == ""
+    assert why in err.splitlines()[-1]
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("option", [("--smooth",), ("--lag", "1.0")])
+def test_hindsight_knows_of_the_lane_change_from_its_beginning(can_imm, log, tmp_path, option):
+    """Same rows and frames; fewer wrong labels than at the time; the picture and the events too."""
+    plain, better = tmp_path / "plain.csv", tmp_path / "better.csv"
+    frames, again = tmp_path / "frames.log", tmp_path / "again.log"
+    events, picture = tmp_path / "events.csv", tmp_path / "drive.png"
+    assert can_imm("replay", log, "--csv", plain, "--out", frames)[0] == 0
+    files = ("--csv", better, "--out", again, "--events", events, "--plot", picture)
+    assert can_imm("replay", log, *option, *files)[0] == 0
+    assert again.read_bytes() == frames.read_bytes()
+    before, after = rows_of(plain.read_text()), rows_of(better.read_text())
+    for column in ("time_s", "object_id"):
+        assert [row[column] for row in after] == [row[column] for row in before]
+
+    def wrong(rows: list[dict[str, str]]) -> int:
+        truth = ["KEEP_RIGHT"] * 20 + ["LANE_CHANGE"] * 20 + ["KEEP_LEFT"] * 21
+        return sum(row["manoeuvre"] != label for row, label in zip(rows, truth, strict=True))
+
+    assert wrong(after) < wrong(before)
+    (change,) = (r for r in rows_of(events.read_text()) if r["manoeuvre"] == "LANE_CHANGE")
+    said = [row["time_s"] for row in after if row["manoeuvre"] == "LANE_CHANGE"]
+    assert (change["from_s"], change["to_s"]) == (said[0], said[-1])
+    assert picture.is_file()
+
+
+def test_both_kinds_of_hindsight_are_one_too_many(can_imm, log):
+    status, _, err = can_imm("replay", log, "--smooth", "--lag", "1")
+    assert status == 2
+    assert "not both" in err
 
 
 def test_estimates_at_every_step(can_imm, log, tmp_path):

@@ -7,8 +7,11 @@ import threading
 import time
 
 import can
+import numpy as np
 import pytest
 
+from can_imm.bus.decoder import ScanDecoder
+from can_imm.bus.profile import load_profile
 from can_imm.bus.sources import LogSource
 from can_imm.types import Manoeuvre
 
@@ -80,6 +83,66 @@ def test_losses(can_imm, scenario, tmp_path):
     assert 0 < ids.count(0x301) < ids.count(0x300)
 
 
+@pytest.mark.parametrize("profile", ["can_imm", "ars408", "toyota", "toyota-tss2", "esr"])
+def test_motorway(can_imm, tmp_path, profile):
+    log, truth = tmp_path / "drive.log", tmp_path / "truth.csv"
+    status, out, err = can_imm(
+        "simulate", "--scenario", "motorway", "--seed", 4, "--profile", profile, "--log", log,
+        "--truth", truth,
+    )  # fmt: skip
+    assert status == 0
+    assert out == ""
+    assert "scans" in err
+    with truth.open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == [
+        "time_s", "object_id", "manoeuvre", "lane", "direction", "event", "x", "vx", "y", "vy",
+        "speed",
+    ]  # fmt: skip
+    assert {"KEEP_LANE", "STATIONARY", "ONCOMING"} <= {row["manoeuvre"] for row in rows}
+    places: dict[str, list[list[float]]] = {}
+    for row in rows:
+        places.setdefault(row["time_s"], []).append([float(row["x"]), float(row["y"])])
+
+    decoder = ScanDecoder(load_profile(profile), 100)
+    errors, speeds, times = [], [], []
+    with LogSource(log) as source:
+        for frame in source:
+            scan = decoder.feed(frame)
+            if scan is None:
+                continue
+            times.append(scan.t_ns)
+            speeds.append(scan.ego_speed)
+            there = np.array(places[f"{scan.t_ns / 1e9:.6f}"])
+            n = scan.n
+            cos, sin = np.cos(scan.angle[:n]), np.sin(scan.angle[:n])
+            x = cos * scan.z[:n, 0] - sin * scan.z[:n, 2]
+            y = sin * scan.z[:n, 0] + cos * scan.z[:n, 2]
+            away = np.hypot(x[:, None] - there[:, 0], y[:, None] - there[:, 1])
+            errors += (away.min(axis=1) / np.maximum(np.hypot(x, y), 50.0)).tolist()
+    period = {"can_imm": 100, "ars408": 1000 / 14}.get(profile, 50)
+    assert len(times) > 0.97 * 60_000 / period
+    assert len(errors) > 4 * len(times)
+    assert np.mean(errors) < 0.01
+    assert np.quantile(errors, 0.999) < 0.05
+    known = np.isfinite(speeds)
+    assert known[5:].all()
+    assert 15.0 < np.nanmin(speeds) < np.nanmax(speeds) < 40.0
+
+
+def test_motorway_settings_and_losses(can_imm, tmp_path):
+    contents = []
+    for options in ((), ("--settings", "tuning"), ("--settings", "reporting"), ("--dropout", 0.5)):
+        path = tmp_path / "drive.log"
+        status, _, _ = can_imm("simulate", "--scenario", "motorway", "--log", path, *options)
+        assert status == 0
+        contents.append(path.read_text())
+    assert contents[0] == contents[1] != contents[2]
+    heads = [content.count(" 300#") for content in contents]
+    assert heads[0] > 580
+    assert 240 < heads[3] < 360
+
+
 def test_on_a_bus_in_real_time_with_truth_in_bus_time(can_imm, tmp_path, no_config):
     scenario = tmp_path / "one.toml"
     scenario.write_text(
@@ -126,6 +189,10 @@ def test_on_a_bus_in_real_time_with_truth_in_bus_time(can_imm, tmp_path, no_conf
         (["--truth", "/no/such/dir/x.csv"], "/no/such/dir/x.csv"),
         (["--log", "x.log", "--missed", "1.5"], "missed"),
         (["--log", "x.log", "--seed", "-1"], "seed"),
+        (["--log", "x.log", "--scenario", "motorway", "--profile", "nope"], "nope"),
+        (["--log", "x.log", "--scenario", "motorway", "--settings", "nope"], "nope"),
+        (["--log", "x.log", "--scenario", "motorway", "--missed", "1.5"], "missed"),
+        (["--log", "x.log", "--profile", "esr"], "profile"),
         (["-i", "socketcan", "-c", "no_such_bus"], "no_such_bus"),
         ([], "cannot open bus"),
     ],

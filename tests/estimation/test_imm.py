@@ -211,7 +211,7 @@ def test_the_mass_of_a_region_moves_the_transition() -> None:
         above = norm.sf(0.3, x[0], np.sqrt(P[0, 0]))
         expected[i] *= [1.0, above, 1.0 - above]
         expected[i] /= expected[i].sum()
-    np.testing.assert_allclose(runner.work[0]["Pi"][:3, :3], expected, rtol=1e-9)
+    np.testing.assert_allclose(runner.objects[0]["Pi"][:3, :3], expected, rtol=1e-9)
 
 
 def test_a_state_that_the_entry_replaces_does_not_count_in_the_transition() -> None:
@@ -222,8 +222,8 @@ def test_a_state_that_the_entry_replaces_does_not_count_in_the_transition() -> N
     record["entry_sources"][0, 1] = 1 << 1
     runner.work[0]["mu"][:2] = 0.5
     imm.transitions_(record["n_states"], record, runner.objects[0], runner.work[0], 5)
-    np.testing.assert_allclose(runner.work[0]["Pi"][0, :2], Pi[0], rtol=1e-12)
-    assert runner.work[0]["Pi"][1, 1] < 1e-12, "staying counts: nothing is replaced there"
+    np.testing.assert_allclose(runner.objects[0]["Pi"][0, :2], Pi[0], rtol=1e-12)
+    assert runner.objects[0]["Pi"][1, 1] < 1e-12, "staying counts: nothing is replaced there"
 
 
 # ---- probabilities

@@ -43,7 +43,8 @@ class FakeBus:
             at, received = self.arrivals.pop(0)
             self.time_ns = max(self.time_ns, at)
             return received
-        self.time_ns = until
+        # to look takes a moment, too
+        self.time_ns = max(until, self.time_ns + US)
         return None
 
 
@@ -76,7 +77,7 @@ class TestBusFeed:
         feed, bus, _ = live(UNIX)
         feed.start_ns(STEP)
         feed.collect(UNIX + STEP)
-        assert bus.time_ns == UNIX + STEP + 2_000_000
+        assert 0 <= bus.time_ns - (UNIX + STEP + 2_000_000) <= US
 
     def test_a_frame_that_is_late_within_the_guard_time_is_not_late(self):
         stamp = UNIX + STEP - US

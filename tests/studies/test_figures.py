@@ -6,7 +6,8 @@ import matplotlib.figure
 import numpy as np
 import pytest
 
-from can_imm import plots
+from can_imm.plots import paper as plots
+from can_imm.plots.style import COLOURS
 from can_imm.studies import figures
 from can_imm.studies.paper import Result, score
 from can_imm.studies.runs import play
@@ -85,7 +86,7 @@ def test_bands_have_the_colours_and_times_of_the_manoeuvres(tmp_path, drawn):
             box = path.get_extents()
             colour = matplotlib.colors.to_hex(collection.get_facecolor()[0])
             bars.append((box.x0, box.x1, round(box.y0 + box.height / 2), colour))
-    palette = plots.COLOURS
+    palette = COLOURS
     assert bars[:5] == [
         (0, 2, 2, palette[Manoeuvre.KEEP_RIGHT]),
         (2, 4, 2, palette[Manoeuvre.LANE_CHANGE]),
@@ -97,8 +98,8 @@ def test_bands_have_the_colours_and_times_of_the_manoeuvres(tmp_path, drawn):
 
 
 def test_every_manoeuvre_has_a_colour_of_its_own():
-    assert set(plots.COLOURS) == set(Manoeuvre)
-    assert len(set(plots.COLOURS.values())) == len(Manoeuvre)
+    assert set(COLOURS) == set(Manoeuvre)
+    assert len(set(COLOURS.values())) == len(Manoeuvre)
 
 
 def test_comparisons_put_table_6_beside_the_published_truths_only(tmp_path, drawn):
