@@ -1,8 +1,8 @@
 """Which slot a measurement belongs to, and what becomes of the slots: a detector's bookkeeping.
 
-A slot is free where ``ids`` is -1; ``free[:n_free[0]]`` are the free ones, the next one last.  Behind
-these, from ``capacity`` on, are the ``n_free[1]`` that were set free lately.  What happens is counted
-in ``tally``, in the order of `TALLY`.
+A slot is free where ``ids`` is -1; ``free[:n_free[0]]`` are the free ones, the next one last.
+Behind these, from ``capacity`` on, are the ``n_free[1]`` that were set free lately.  What happens
+is counted in ``tally``, in the order of `TALLY`.
 """
 
 from __future__ import annotations

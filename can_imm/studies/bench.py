@@ -190,14 +190,15 @@ class Estimator:
 
     def __init__(self, bank: ModeBank, n: int) -> None:
         assert bank.measurement_variance is not None
-        self._scans = [np.repeat(row[None], n, 0) for row in _measurements()]
+        self.scans = [np.repeat(row[None], n, 0) for row in _measurements()]
+        self.objects = np.zeros(n, layout.OBJECT_DTYPE)
         self._steps: IntArray = np.zeros(n, np.int32)
         self._z: FloatArray = np.zeros((n, 4))
         self._n = n
         self._processor = Processor(
             np.inf,
             bank=bank.record,
-            objects=np.zeros(n, layout.OBJECT_DTYPE),
+            objects=self.objects,
             work=np.zeros(1, layout.WORK_DTYPE),
             slot=np.arange(n, dtype=np.int32),
             steps=self._steps,
@@ -214,16 +215,19 @@ class Estimator:
 
     def run(self) -> None:
         """A birth and the cycles after it."""
-        process, address, n = self._processor.run, self._processor.address, self._n
-        z = self._z
+        for _ in self.steps():
+            pass
+
+    def steps(self) -> Iterator[FloatArray]:
+        """The birth and the cycles one by one; gives the measurements (n, 4) of each."""
+        process, address, n, z = self._processor.run, self._processor.address, self._n, self._z
         self._steps[:] = -1
-        for row in self._scans[:1]:
+        for k, row in enumerate(self.scans):
             z[:] = row
             process(address, n, layout.UNKNOWN_GROUND, 0.0, 0.0)
-        self._steps[:] = STEPS
-        for row in self._scans[1:]:
-            z[:] = row
-            process(address, n, layout.UNKNOWN_GROUND, 0.0, 0.0)
+            if k == 0:
+                self._steps[:] = STEPS
+            yield row
 
 
 def _filterpy(bank: ModeBank) -> None:
