@@ -109,7 +109,7 @@ class BusFeed:
                     timeout_s -= AWAKE_S
                 elif remaining_s > REHEARSE_S:
                     timeout_s -= REHEARSE_S
-                else:
+                elif remaining_s > 2 * AWAKE_S:
                     rehearsed = True
                     self.rehearse(t_ns, list(self._pending))
                     continue
