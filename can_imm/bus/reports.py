@@ -174,7 +174,7 @@ class ReportPacker:
         self._directions, self._events = np.array(directions), np.array(events)
         self._out = np.zeros((2, 8), np.uint8)
         arguments = self._arguments(np.zeros(1, REPORT_DTYPE), 0, True)
-        signature = tuple(map(numba.typeof, arguments))  # type: ignore[no-untyped-call]
+        signature = tuple(map(numba.typeof, arguments))
         pack_.compile(signature)
         self._pack = pack_.get_overload(signature)
 

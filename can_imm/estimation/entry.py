@@ -7,6 +7,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from numba import carray as _view  # type: ignore[attr-defined]
 from numba import types
 from numba.extending import intrinsic
 
@@ -56,28 +57,28 @@ _pointer: Any = intrinsic(_to_pointer)
 def _process(
     address: int, n: int, ground: float, lane_width: float, age: float
 ) -> None:  # pragma: no cover - compiled
-    call = numba.carray(_pointer(address), 1, _CALL_DTYPE)[0]
+    call = _view(_pointer(address), 1, _CALL_DTYPE)[0]
     count, rows = call.n_particles, call.rows
     imm.process_scan_(
-        numba.carray(_pointer(call.bank), 1, BANK_DTYPE),
-        numba.carray(_pointer(call.objects), call.capacity, OBJECT_DTYPE),
-        numba.carray(_pointer(call.work), 1, WORK_DTYPE),
+        _view(_pointer(call.bank), 1, BANK_DTYPE),
+        _view(_pointer(call.objects), call.capacity, OBJECT_DTYPE),
+        _view(_pointer(call.work), 1, WORK_DTYPE),
         n,
-        numba.carray(_pointer(call.slot), rows, np.int32),
-        numba.carray(_pointer(call.steps), rows, np.int32),
-        numba.carray(_pointer(call.z), (rows, 4), np.float64),
-        numba.carray(_pointer(call.r), (rows, 4), np.float64),
-        numba.carray(_pointer(call.valid), (rows, 4), np.bool_),
-        numba.carray(_pointer(call.angle), rows, np.float64),
+        _view(_pointer(call.slot), rows, np.int32),
+        _view(_pointer(call.steps), rows, np.int32),
+        _view(_pointer(call.z), (rows, 4), np.float64),
+        _view(_pointer(call.r), (rows, 4), np.float64),
+        _view(_pointer(call.valid), (rows, 4), np.bool_),
+        _view(_pointer(call.angle), rows, np.float64),
         ground,
         lane_width,
         age,
         call.gate,
-        numba.carray(_pointer(call.particles), (call.capacity, N_COLUMNS, count), np.float64),
-        numba.carray(_pointer(call.spare), (N_SCRATCH, count), np.float64),
-        numba.carray(_pointer(call.weights), count, np.float64),
-        numba.carray(_pointer(call.noise), 4, np.uint64),
-        numba.carray(_pointer(call.status), rows, np.int8),
+        _view(_pointer(call.particles), (call.capacity, N_COLUMNS, count), np.float64),
+        _view(_pointer(call.spare), (N_SCRATCH, count), np.float64),
+        _view(_pointer(call.weights), count, np.float64),
+        _view(_pointer(call.noise), 4, np.uint64),
+        _view(_pointer(call.status), rows, np.int8),
     )
 
 

@@ -28,7 +28,7 @@ REHEARSE_S = 600e-6
 """So long before a live step with frames [s] it is rehearsed: what a step needs is in none of the
 processor's caches after some milliseconds of other work."""
 
-AWAKE_S = 150e-6
+AWAKE_S = 80e-6
 """So long before such a step [s] the loop stops sleeping, for waking up takes that time."""
 
 Rehearsal = Callable[[int, list[Frame]], None]

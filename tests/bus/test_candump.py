@@ -136,4 +136,5 @@ def test_the_short_way_and_the_patterns_agree(time, channel, body, end):
     slow = _parse_slowly(line)
     _parse_slowly("(0.000000) c 210#"), _parse_slowly("(0.000000) c 7fF#")
     assert parse(line) == slow
-    assert parse(f"(12.345678) can0 210#{'AB' * 4} R\n") == Frame(12_345_678_000, 0x210, b"\xab" * 4, "can0")  # fmt: skip
+    known = Frame(12_345_678_000, 0x210, b"\xab" * 4, "can0")
+    assert parse(f"(12.345678) can0 210#{'AB' * 4} R\n") == known
