@@ -8,18 +8,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from can_imm.estimation import imm, layout
-from can_imm.estimation.entry import entry_point
+from can_imm.estimation import layout
+from can_imm.estimation.entry import Processor, entry_point
 from can_imm.estimation.noise import noise_state
-from can_imm.estimation.particles import N_COLUMNS
+from can_imm.estimation.particles import N_COLUMNS, N_SCRATCH
+from can_imm.estimation.tracks import TALLY, assign_, bury_, settle_, straighten_
 from can_imm.manoeuvres import ModeBank
 from can_imm.relations import MEMORY_DTYPE, relate_, shift_lanes_
 from can_imm.reporting import extrapolate_all_, fill_reports_
 from can_imm.road import RoadFrame
 from can_imm.types import REPORT_DTYPE, BoolArray, CanImmError, FloatArray, IntArray, Scan
-
-LARGEST = 1e6
-"""A measured value, or standard deviation, beyond this is invalid; squares cannot overflow."""
 
 FASTEST, SHARPEST = 150.0, 5.0
 """No vehicle drives [m/s] or turns [rad/s] faster: a bus that says so does not know."""
@@ -145,8 +143,8 @@ class Detector:
         self._noise = noise_state(np.random.default_rng(seed))
         self._objects = np.zeros(capacity, layout.OBJECT_DTYPE)
         self._work = np.zeros(1, layout.WORK_DTYPE)
-        self._particles: FloatArray = np.zeros((capacity, bank.n_particles, N_COLUMNS))
-        self._spare: FloatArray = np.zeros((bank.n_particles, N_COLUMNS))
+        self._particles: FloatArray = np.zeros((capacity, N_COLUMNS, bank.n_particles))
+        self._spare: FloatArray = np.zeros((N_SCRATCH, bank.n_particles))
         self._weights: FloatArray = np.zeros(bank.n_particles)
         # per slot
         self._id: IntArray = np.full(capacity, -1, np.int32)
@@ -154,14 +152,21 @@ class Detector:
         self._age: IntArray = np.zeros(capacity, np.int32)
         self._outliers: IntArray = np.zeros(capacity, np.int32)
         self._measured = np.zeros(capacity, np.bool_)
-        self._slot_of: dict[int, int] = {}
-        self._free = list(range(capacity - 1, -1, -1))
+        # the free slots, and those set free in a step: by an id's reuse, a failure and by coasting
+        self._free: IntArray = np.zeros(4 * capacity, np.int32)
+        self._free[:capacity] = range(capacity - 1, -1, -1)
+        self._n_free = np.array([capacity, 0])
+        self._tally = np.zeros(len(TALLY), np.int64)
+        self._next_burial = 0
+        variance = bank.measurement_variance
+        self._variance: FloatArray = np.zeros(0) if variance is None else variance
         # per row of a scan; a scan may hold more rows than there are slots
         self._slot: IntArray = np.zeros(0, np.int32)
         self._steps: IntArray = np.zeros(0, np.int32)
         self._status = np.zeros(0, np.int8)
         self._z: FloatArray = np.zeros((0, 4))
         self._r: FloatArray = np.zeros((0, 4))
+        self._valid: BoolArray = np.zeros((0, 4), np.bool_)
         self._angle: FloatArray = np.zeros(0)
         # what lies between objects and between scans
         self._memory = np.zeros(capacity, MEMORY_DTYPE)
@@ -175,7 +180,7 @@ class Detector:
     @property
     def n_tracked(self) -> int:
         """Number of objects tracked now."""
-        return len(self._slot_of)
+        return self.capacity - int(self._n_free[0])
 
     @property
     def road(self) -> RoadFrame | None:
@@ -190,18 +195,25 @@ class Detector:
             self._status = np.zeros(n, np.int8)
             self._z = np.zeros((n, 4))
             self._r = np.zeros((n, 4))
+            self._valid = np.zeros((n, 4), np.bool_)
             self._angle = np.zeros(n)
+            self._processor = self._pack()
 
     def _warm_up(self) -> None:
         """Compile, or load from the cache, every kernel that `step` and `predict` call."""
         scan = Scan(1)
         self._grow_rows(self.capacity)
-        self._slot[0] = -1
         relate_(self._id, self._memory, self.reports, 0)
         shift_lanes_(self._memory, 0)
-        arguments = self._arguments(scan, 1, 0.0)
-        self._process = entry_point(imm.process_scan_, *arguments)
-        self._process(*arguments)
+        self._processor.run(self._processor.address, 0, 0.0, 0.0, 0.0)
+        arguments = self._assign_arguments(scan, 0, 0)
+        self._assign = entry_point(assign_, *arguments)
+        self._assign(*arguments)
+        straighten_(*self._straighten_arguments(0))
+        arguments = self._settle_arguments(0, 0)
+        self._settle = entry_point(settle_, *arguments)
+        self._settle(*arguments)
+        self._bury(0)
         arguments = self._report_arguments(0)
         self._fill = entry_point(fill_reports_, *arguments)
         self._fill(*arguments)
@@ -221,19 +233,26 @@ class Detector:
         """
         now = t_ns // self._step_ns
         if scan is None or not self._accept(t_ns, scan):
-            if self._slot_of:
+            if now >= self._next_burial:
                 self._bury(now)
             return 0
         self._grow_rows(scan.n)
         n = scan.n
-        self._measured[:] = False
-        self._assign(scan, now)
-        self._take_measurements(scan)
+        self._assign(*self._assign_arguments(scan, n, now))
+        if self.bank.n_particles:
+            straighten_(*self._straighten_arguments(n))
+        self._hear_ego(scan)
         if self._road is not None:
             self._road.move(scan.t_ns, self._ego_speed, self._ego_yaw_rate)
             self._road.localise_(scan, self._z, self._r)
-        self._process(*self._arguments(scan, n, (t_ns - scan.t_ns) * 1e-9))
-        self._settle(scan, now)
+        self._processor.run(
+            self._processor.address,
+            n,
+            layout.UNKNOWN_GROUND if math.isnan(self._ego_speed) else -self._ego_speed,
+            0.0 if self._road is None else self._road.width,
+            (t_ns - scan.t_ns) * 1e-9,
+        )
+        self._settle(*self._settle_arguments(n, now))
         moved = 0
         if self._road is not None:
             moved = self._road.watch_(
@@ -244,42 +263,17 @@ class Detector:
         self._bury(now)
         return self._report(t_ns, now, moved)
 
-    def _take_measurements(self, scan: Scan) -> None:
-        """Values, variances and axes of the scan, in buffers of our own."""
-        n = scan.n
-        self._z[:n] = scan.z[:n]
-        self._angle[:n] = scan.angle[:n]
-        np.clip(scan.std[:n], 0.0, LARGEST, out=self._r[:n])
-        np.square(self._r[:n], out=self._r[:n])
-        if self.bank.n_particles:
-            self._straighten(scan)
-        if self.bank.measurement_variance is not None:
-            self._r[:n] = self.bank.measurement_variance
+    def _hear_ego(self, scan: Scan) -> None:
+        """Take over the ego's motion, where the bus tells one that is possible."""
         self._ego_speed = possible(scan.ego_speed, FASTEST)
         self._ego_yaw_rate = possible(scan.ego_yaw_rate, SHARPEST)
         told = math.isnan(scan.ego_speed), math.isnan(scan.ego_yaw_rate)
         if told != (math.isnan(self._ego_speed), math.isnan(self._ego_yaw_rate)):
             self.counts.ego_invalid += 1
 
-    def _straighten(self, scan: Scan) -> None:
-        """Measurements in turned axes as ones in the vehicle's, since particles know no others.
-
-        Variances go along, the covariance between the axes is dropped.  A pair of which only the
-        first value was measured stays as it is: a speed along the line of sight is taken as vx.
-        """
-        n = scan.n
-        turned = (self._angle[:n] != 0.0) & (self._slot[:n] >= 0)
-        if not turned.any():
-            return
-        for c in (0, 1):
-            k = np.flatnonzero(turned & scan.valid[:n, c] & scan.valid[:n, c + 2])
-            cos, sin = np.cos(self._angle[k]), np.sin(self._angle[k])
-            u, w = self._z[k, c], self._z[k, c + 2]
-            self._z[k, c], self._z[k, c + 2] = u * cos - w * sin, u * sin + w * cos
-            u, w = self._r[k, c], self._r[k, c + 2]
-            self._r[k, c] = u * cos**2 + w * sin**2
-            self._r[k, c + 2] = u * sin**2 + w * cos**2
-        self._angle[:n] = 0.0
+    def understudy(self) -> Detector:
+        """A small detector like this one, for `runtime.nodes.DetectorNode.rehearse`."""
+        return Detector(self.bank, capacity=2)
 
     def predict(self, t_ns: int) -> int:
         """Extrapolate every tracked object to the step at ``t_ns`` into `predicted`.
@@ -327,108 +321,63 @@ class Detector:
         self.counts.scans += 1
         return True
 
-    def _assign(self, scan: Scan, now: int) -> None:
-        """Give every row of the scan its slot (-1: none) and the steps since its last update."""
-        seen: set[int] = set()
-        std = scan.std[: scan.n]
-        valid = scan.valid[: scan.n]
-        usable = (np.abs(scan.z[: scan.n]) < LARGEST) & (std > 0.0) & (std < LARGEST) & valid
-        # usable where it counts, and in one component at least
-        straight = np.abs(scan.angle[: scan.n]) <= LARGEST
-        sound = ((usable == valid).all(1) & usable.any(1) & straight).tolist()
-        new = scan.new[: scan.n].tolist()
-        self._slot[: scan.n] = -1
-        for k, name in enumerate(scan.ids[: scan.n].tolist()):
-            if name in seen:
-                self.counts.duplicates += 1
-                continue
-            seen.add(name)
-            if not sound[k]:
-                self.counts.invalid += 1
-                continue
-            slot = self._slot_of.get(name)
-            if slot is not None and new[k]:
-                self.counts.reused_ids += 1
-                self._end(name)
-                slot = None
-            elif slot is not None and now - self._updated[slot] > self._coast_steps:
-                self._end(name)
-                slot = None
-            if slot is None:
-                if not self._free:
-                    self.counts.overflow += 1
-                    continue
-                slot = self._free.pop()
-                self._slot_of[name] = slot
-                self._id[slot] = name
-                self._age[slot] = 0
-                self._outliers[slot] = 0
-                self.counts.births += 1
-            self._slot[k] = slot
-            self._steps[k] = -1 if self._age[slot] == 0 else now - self._updated[slot]
-
-    def _arguments(self, scan: Scan, n: int, age: float) -> tuple[Any, ...]:
-        """Of `imm.process_scan_`."""
-        return (
-            self.bank.record,
-            self._objects,
-            self._work,
-            n,
-            self._slot,
-            self._steps,
-            self._z,
-            self._r,
-            scan.valid,
-            self._angle,
-            layout.UNKNOWN_GROUND if math.isnan(self._ego_speed) else -self._ego_speed,
-            0.0 if self._road is None else self._road.width,
-            age,
+    def _pack(self) -> Processor:
+        """The kernel and the addresses of what it works on."""
+        return Processor(
             self._gate,
-            self._particles,
-            self._spare,
-            self._weights,
-            self._noise,
-            self._status,
+            bank=self.bank.record,
+            objects=self._objects,
+            work=self._work,
+            slot=self._slot,
+            steps=self._steps,
+            z=self._z,
+            r=self._r,
+            valid=self._valid,
+            angle=self._angle,
+            particles=self._particles,
+            spare=self._spare,
+            weights=self._weights,
+            noise=self._noise,
+            status=self._status,
         )
 
-    def _settle(self, scan: Scan, now: int) -> None:
-        """Act on what became of every measurement."""
-        slots, states = self._slot[: scan.n].tolist(), self._status[: scan.n].tolist()
-        for slot, status in zip(slots, states, strict=True):
-            if slot < 0:
-                continue
-            if status == imm.OK:
-                self.counts.measurements += 1
-                self._updated[slot] = now
-                self._age[slot] += 1
-                self._outliers[slot] = 0
-                self._measured[slot] = True
-                continue
-            if status == imm.OUTLIER:
-                self.counts.outliers += 1
-                self._outliers[slot] += 1
-                if self._outliers[slot] < self._max_outliers:
-                    continue
-                self.counts.reused_ids += 1
-            else:
-                self.counts.numeric_failures += 1
-            # The id's next measurement begins a new track.
-            self._end(int(self._id[slot]))
+    def _assign_arguments(self, scan: Scan, n: int, now: int) -> tuple[Any, ...]:
+        """Of `tracks.assign_`."""
+        return (
+            n, now, self._coast_steps, scan.ids, scan.new, scan.z, scan.std, scan.valid, scan.angle,
+            self._variance, self._slot, self._steps, self._z, self._r, self._valid, self._angle,
+            self._id, self._updated, self._age, self._outliers, self._measured, self._free,
+            self._n_free, self._tally,
+        )  # fmt: skip
 
-    def _end(self, name: int) -> None:
-        slot = self._slot_of.pop(name)
-        self._id[slot] = -1
-        self._free.append(slot)
-        self.counts.deaths += 1
-        if self.history is not None:
-            self.history.end(slot)
+    def _straighten_arguments(self, n: int) -> tuple[Any, ...]:
+        """Of `tracks.straighten_`."""
+        return n, self._slot, self._z, self._r, self._valid, self._angle, not len(self._variance)
+
+    def _settle_arguments(self, n: int, now: int) -> tuple[Any, ...]:
+        """Of `tracks.settle_`."""
+        return (
+            n, now, self._max_outliers, self._slot, self._status, self._id, self._updated,
+            self._age, self._outliers, self._measured, self._free, self._n_free, self._tally,
+        )  # fmt: skip
 
     def _bury(self, now: int) -> None:
         """End the tracks that coasted for too long."""
-        updated = self._updated.tolist()
-        for name, slot in list(self._slot_of.items()):
-            if now - updated[slot] > self._coast_steps:
-                self._end(name)
+        self._next_burial = bury_(
+            now, self._coast_steps, self._id, self._updated, self._free, self._n_free, self._tally
+        )
+        self._count()
+
+    def _count(self) -> None:
+        """Add what the kernels counted."""
+        for name, number in zip(TALLY, self._tally.tolist(), strict=True):
+            if number:
+                setattr(self.counts, name, getattr(self.counts, name) + number)
+        self._tally[:] = 0
+        if self.history is not None:
+            for slot in self._free[self.capacity :][: self._n_free[1]].tolist():
+                self.history.end(slot)
+        self._n_free[1] = 0
 
     def _report_arguments(self, t_ns: int) -> tuple[Any, ...]:
         """Of `fill_reports_`."""

@@ -17,7 +17,8 @@ USUAL = {
     "width": 3.5, "width_std": 0.25, "offset": 0.0, "offset_std": 0.3, "offset_time": 8.0,
     "heading_std": 0.01, "heading_time": 2.0, "turn_std": 0.01, "turn_time": 1.0,
     "curvature_std": 0.001, "curvature_length": 1000.0, "change_std": 6e-6, "change_length": 100.0,
-    "far_curvature": 3e-4, "bias_std": 0.005, "mounting_std": 0.003, "yaw_noise": 0.001, "yaw_noise_unknown": 0.01,
+    "far_curvature": 3e-4, "bias_std": 0.005, "mounting_std": 0.003, "yaw_noise": 0.001,
+    "yaw_noise_unknown": 0.01,
     "drift": 0.05, "wander_std": 0.2, "wander_time": 4.0, "freedom": 0.1, "freedom_changing": 1.0,
     "error_weight": 3.0, "error_most": 0.5, "speed_error_weight": 10.0, "speed_error_most": 2.0,
 }  # fmt: skip
@@ -47,7 +48,7 @@ def small_bank() -> np.ndarray[Any, Any]:
 
 
 class Traffic:
-    """The road filter with its buffers: one call per scan of vehicles, all in slots of their own."""
+    """The road filter with its buffers: one call per scan of vehicles."""
 
     def __init__(self, par: FloatArray, capacity: int = 32) -> None:
         self.par = par

@@ -368,7 +368,7 @@ def test_a_numeric_failure_ends_the_track_and_nothing_else(double: ModeBank) -> 
     detector = Detector(double)
     run(detector, scan(0, (1, HERE), (2, HERE)))
     # nothing that a sensor says leads there any more
-    detector._objects["P"][detector._slot_of[1]] = math.nan
+    detector._objects["P"][detector._id == 1] = math.nan
     n = run(detector, scan(100, (1, HERE), (2, HERE)))
     assert detector.counts.numeric_failures == 1
     assert n == 1

@@ -10,6 +10,8 @@ import re
 
 from can_imm.bus.frame import BRS, DLC_SHIFT, ERROR, ESI, EXTENDED, FD, REMOTE, TX, Frame
 
+_new_frame = tuple.__new__
+
 _ERROR_BIT = 0x2000_0000
 _HEAD = r"\((\d{1,12})\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
 # the digit after "_" is a length code above 8, which says nothing about the data
@@ -21,8 +23,38 @@ _OTHER = re.compile(
 _DROPPED = re.compile(r"DROPCOUNT: dropped (\d+) CAN frames").match
 
 
+_KNOWN_IDS: dict[str, int] = {}
+"""11-bit ids by how they are written, as far as they have been seen and checked."""
+
+
 def parse(line: str) -> Frame | None:
     """The frame in a line of a candump log, None if there is none that makes sense."""
+    # What nearly all lines look like: "(1700000000.123456) can0 210#9338", with or without " R".
+    # Whatever is odd about a line leaves it to the patterns.
+    parts = line.split()
+    n = len(parts)
+    if (n == 3 or (n == 4 and parts[3] == "R")) and line[:1] == "(" and line.isascii():
+        time, channel, body = parts[:3]
+        stamp = time[1:-8] + time[-7:-1]
+        known = _KNOWN_IDS.get(body[:3], -1)
+        if (
+            known >= 0
+            and 4 <= len(body) <= 20
+            and body[3] == "#"
+            and 10 <= len(time) <= 21
+            and time[-8] == "."
+            and time[-1] == ")"
+            and stamp.isdecimal()
+        ):
+            try:
+                data = bytes.fromhex(body[4:])
+            except ValueError:
+                return _parse_slowly(line)
+            return _new_frame(Frame, (int(stamp) * 1000, known, data, channel, 0))
+    return _parse_slowly(line)
+
+
+def _parse_slowly(line: str) -> Frame | None:
     match = _CLASSIC(line)
     if match is None:
         return _parse_other(line)
@@ -35,6 +67,8 @@ def parse(line: str) -> Frame | None:
         number, flags = _id_and_flags(frame_id, direction)
         if number < 0:
             return None
+    elif len(frame_id) == 3:
+        _KNOWN_IDS[frame_id] = number
     return Frame(_time(seconds, fraction), number, bytes.fromhex(digits), channel, flags)
 
 

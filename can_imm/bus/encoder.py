@@ -14,12 +14,13 @@ from can_imm.bus.codec import compile_packer, field, load_dbc
 from can_imm.bus.frame import Frame
 from can_imm.bus.profile import dbc_dir
 from can_imm.bus.protection import P01_COUNTERS, p01_data_id, p01_protect
+from can_imm.bus.reports import ReportPacker, signal_table
 from can_imm.types import CUT_IN, CUT_OUT, OVERTAKING_ANOTHER, Scan
 
 DBC = dbc_dir() / "can_imm.dbc"
 
-STATUS_ID = 0x31F
-OUTPUT_IDS = frozenset({0x310, 0x311, STATUS_ID})
+STATE_ID, ESTIMATE_ID, STATUS_ID = 0x310, 0x311, 0x31F
+OUTPUT_IDS = frozenset({STATE_ID, ESTIMATE_ID, STATUS_ID})
 """ManoeuvreState, ObjectEstimate, DetectorStatus."""
 
 DIRECTIONS = (0, 1, -1)
@@ -32,11 +33,6 @@ EVENTS = tuple(
 """Value of signal Event by a report's flags: there is room for one of them."""
 
 _SENSOR_OBJECTS = range(64)
-_OUTPUT_OBJECTS = range(255)
-_REPORTED = (
-    "object_id", "direction", "lane", "flags", "probability", "second_probability", "x",
-    "coasting", "manoeuvre", "second", "age",
-)  # fmt: skip
 
 
 class DetectorState(IntEnum):
@@ -91,6 +87,15 @@ class MessageEncoder:
         return Frame(t_ns, self.id, bytes(data))
 
 
+def _signals(name: str, signals: tuple[str, ...]) -> tuple[npt.NDArray[Any], int]:
+    """How a kernel packs a message of can_imm.dbc, and the message's data id."""
+    message = own_dbc().get_message_by_name(name)
+    parts = [message.get_signal_by_name(signal) for signal in signals]
+    assert message.length == 8
+    assert all(s.byte_order == "little_endian" and not s.is_signed for s in parts)
+    return signal_table([(s.start, field(s)) for s in parts]), p01_data_id(message, DBC)
+
+
 class RadarEncoder:
     """A radar-like sensor's frames: RadarScan, then a RadarObject per object.
 
@@ -132,14 +137,15 @@ class ManoeuvreEncoder:
     """
 
     def __init__(self) -> None:
-        self._state = MessageEncoder(
+        state, state_id = _signals(
             "ManoeuvreState",
             ("ObjectId", "Direction", "Lane", "Event", "Probability", "SecondProbability",
              "Coasting", "Manoeuvre", "SecondManoeuvre", "TrackAge"),
         )  # fmt: skip
-        self._estimate = MessageEncoder(
+        estimate, estimate_id = _signals(
             "ObjectEstimate", ("ObjectId", "DistLong", "VrelLong", "DistLat", "VrelLat")
         )
+        self._packer = ReportPacker(state, estimate, (state_id, estimate_id), DIRECTIONS, EVENTS)
         self._status = MessageEncoder(
             "DetectorStatus",
             ("State", "ObjectsTracked", "DeadlineMisses", "FramesRejected", "DroppedScans"),
@@ -147,27 +153,24 @@ class ManoeuvreEncoder:
         self.status_period_ns = self._status.cycle_ns
         self.left_out = 0
 
-    def encode(self, reports: npt.NDArray[np.void], t_ns: int) -> list[Frame]:
+    def encode(
+        self, reports: npt.NDArray[np.void], t_ns: int, channel: str | None = None
+    ) -> list[Frame]:
         """ManoeuvreState and ObjectEstimate for each of the reports (REPORT_DTYPE)."""
+        data, count = self._packer.pack(reports, states=True)
+        self.left_out += len(reports) - count // 2
         frames = []
-        columns = (reports[name].tolist() for name in _REPORTED)
-        for object_id, direction, lane, flags, p, second_p, x, *rest in zip(*columns, strict=True):
-            if object_id not in _OUTPUT_OBJECTS:
-                self.left_out += 1
-                continue
-            where, event = DIRECTIONS.index(direction), EVENTS[flags]
-            frames.append(
-                self._state.encode(
-                    t_ns, object_id, where, lane, event, 100 * p, 100 * second_p, *rest
-                )
-            )
-            frames.append(self._estimate.encode(t_ns, object_id, *x))
+        for k in range(0, 8 * count, 16):
+            frames.append(Frame(t_ns, STATE_ID, data[k : k + 8], channel))
+            frames.append(Frame(t_ns, ESTIMATE_ID, data[k + 8 : k + 16], channel))
         return frames
 
-    def estimates(self, reports: npt.NDArray[np.void], t_ns: int) -> list[Frame]:
+    def estimates(
+        self, reports: npt.NDArray[np.void], t_ns: int, channel: str | None = None
+    ) -> list[Frame]:
         """ObjectEstimate alone for each of the reports (REPORT_DTYPE)."""
-        rows = zip(reports["object_id"].tolist(), reports["x"].tolist(), strict=True)
-        return [self._estimate.encode(t_ns, i, *x) for i, x in rows if i in _OUTPUT_OBJECTS]
+        data, count = self._packer.pack(reports, states=False)
+        return [Frame(t_ns, ESTIMATE_ID, data[k : k + 8], channel) for k in range(0, 8 * count, 8)]
 
     def status(self, t_ns: int, values: StatusValues) -> Frame:
         """DetectorStatus."""

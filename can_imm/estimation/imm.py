@@ -19,12 +19,20 @@ from can_imm.estimation.layout import (
     GROUND,
     LANE,
     LOG_FLOOR,
+    NEGLIGIBLE_RISE,
     NEGLIGIBLE_WEIGHT,
     UNREACHABLE,
 )
-from can_imm.estimation.modes import keep_combined_, update_mode_, update_particles_
+from can_imm.estimation.modes import (
+    keep_combined_,
+    particle_limit,
+    update_mode_,
+    update_particles_,
+)
 from can_imm.estimation.noise import NoiseState
 from can_imm.types import FloatArray
+
+TWO_PI = 2.0 * math.pi
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -141,11 +149,14 @@ def surprise(
     """
     d = 0.0
     tau = m * bank.step_s - age
+    cos, sin = 1.0, 0.0
+    if angle != 0.0:
+        cos, sin = math.cos(angle), math.sin(angle)
     for c in range(4):
         if valid[c]:
             # shares of the two axes in the measured component
-            f = math.cos(angle) if c < 2 else -math.sin(angle)
-            g = math.sin(angle) if c < 2 else math.cos(angle)
+            f = cos if c < 2 else -sin
+            g = sin if c < 2 else cos
             a = c % 2  # 0 a position, 1 a speed
             b = a + 2
             e = z[c] - f * obj.mean[a] - g * obj.mean[b]
@@ -155,6 +166,47 @@ def surprise(
             v += g * g * (obj.cov[b, b] + bank.jump_std[b] ** 2) + 2.0 * f * g * obj.cov[a, b]
             d += e * e / (v + r[c])
     return d
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def order_modes_(bank: Any, obj: Any, work: Any) -> None:  # pragma: no cover - compiled
+    """Probabilities of the modes before the measurement into work.c, and into work.order the
+    likeliest first, for the others to be held against, and the particles last: they cost most."""
+    n_modes = bank.n_modes
+    for j in range(n_modes):
+        work.c[j] = 0.0
+    for i in range(n_modes):
+        if work.mu[i] > 0.0:
+            for j in range(n_modes):
+                work.c[j] += obj.Pi[i, j] * work.mu[i]
+    first = -1
+    last = n_modes
+    for j in range(n_modes):
+        if not bank.is_particle[j] and (first < 0 or work.c[j] > work.c[first]):
+            first = j
+    k = 0
+    if first >= 0:
+        work.order[0] = first
+        k = 1
+    for j in range(n_modes):
+        if j == first:
+            continue
+        if bank.is_particle[j]:
+            last -= 1
+            work.order[last] = j
+        else:
+            work.order[k] = j
+            k += 1
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def peak_density(r: FloatArray, valid: Any) -> float:  # pragma: no cover - compiled
+    """Log density of the measurement noise at zero, which no mode's likelihood exceeds."""
+    product = 1.0
+    for c in range(4):
+        if valid[c]:
+            product *= TWO_PI * r[c]
+    return -0.5 * math.log(product)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -183,8 +235,8 @@ def cycle_(
         z, r: (4,) measured x, vx, y, vy and their variances.  valid: (4,) bool.
         age: of the measurement [s].
         gate: z is an outlier if its `surprise` is larger; inf switches the gate off.
-        particles: (N, 7) the object's particles; N may be 0 in a bank without a particle mode.
-        spare: (N, 7) scratch.  weights: (N,) scratch.
+        particles: (7, N) the object's particles; N may be 0 in a bank without a particle mode.
+        spare: (10, N) scratch.  weights: (N,) scratch.
         noise: state of the random numbers, used by the particle mode only.
 
     Returns:
@@ -197,26 +249,32 @@ def cycle_(
     work.elapsed = m * bank.step_s
     present_(bank, obj, work.mu)
     transitions_(n, bank, obj, work, m)
-    for j in range(n_modes):
-        c = 0.0
-        for i in range(n_modes):
-            work.w[i] = obj.Pi[i, j] * work.mu[i]
-            c += work.w[i]
-        work.c[j] = c
-        for i in range(n_modes):
-            work.w[i] = work.w[i] / c if work.w[i] > NEGLIGIBLE_WEIGHT * c else 0.0
+    order_modes_(bank, obj, work)
+    peak = peak_density(r, valid)
+    worth = math.log(bank.mu_floor * NEGLIGIBLE_RISE)  # -inf without a floor
+    best = -np.inf
+    for k in range(n_modes):
+        j = work.order[k]
+        c = work.c[j]
         log_l = LOG_FLOOR
         if c < UNREACHABLE:
             work.c[j] = 0.0
-            keep_combined_(n, obj, work.x[j], work.P[j])
-        elif bank.is_particle[j]:
-            log_l = update_particles_(
-                bank, obj, work, j, m, z, r, valid, age, particles, spare, weights, noise
-            )
-        else:
-            mix_(n, bank, obj, work, j, m)
-            predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
-            log_l = update_mode_(n, bank, work, j, z, r, valid, age)
+        elif math.log(c) + peak > best + worth:
+            for i in range(n_modes):
+                p = obj.Pi[i, j] * work.mu[i]
+                work.w[i] = p / c if p > NEGLIGIBLE_WEIGHT * c else 0.0
+            if not bank.is_particle[j]:
+                mix_(n, bank, obj, work, j, m)
+                predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
+                log_l = update_mode_(n, bank, work, j, z, r, valid, age)
+                best = max(best, math.log(c) + log_l)
+            elif (
+                math.log(c) + peak + particle_limit(bank, obj, work, j, m, z, r, valid, age)
+                > best + worth
+            ):
+                log_l = update_particles_(
+                    bank, obj, work, j, m, z, r, valid, age, particles, spare, weights, noise
+                )
         if not log_l > LOG_FLOOR:
             # Also a numeric failure: what is left of its state must not reach the others.
             keep_combined_(n, obj, work.x[j], work.P[j])
@@ -364,7 +422,7 @@ def process_scan_(
         ground: speed of the ground against the ego vehicle, or `UNKNOWN_GROUND` [m/s].
         lane_width: of the road [m]; 0 leaves it to each object.
         age, gate, spare, weights, noise: as for `cycle_`.
-        particles: (capacity, n_particles, 7).
+        particles: (capacity, 7, n_particles).
         status: (N,) int8, written: OK, OUTLIER or FAILED.
     """
     work[0].ground = ground

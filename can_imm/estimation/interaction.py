@@ -8,7 +8,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from can_imm.estimation.constraints import normal_mass
+from can_imm.estimation.constraints import normal_probability
 from can_imm.estimation.layout import FIXED, GROUND, SPEED_STEP
 from can_imm.types import VX, FloatArray, X
 
@@ -98,14 +98,14 @@ def transitions_(
     """
     n_modes = bank.n_modes
     for i in range(n_modes):
-        for j in range(n_modes):
-            obj.Pi[i, j] = bank.Pi[m, i, j]
         if work.mu[i] == 0.0:
+            for j in range(n_modes):
+                obj.Pi[i, j] = bank.Pi[m, i, j]
             continue
         done = 0  # bits of the states that have been moved on
         total = 0.0
         for j in range(n_modes):
-            log_mass = 0.0
+            p = bank.Pi[m, i, j]
             for c in range(bank.n_bounds[j]):
                 s = bank.bound_state[j, c]
                 if not bank.bound_mass[j, c] or (bank.entry_sources[i, j] >> s & 1):
@@ -121,24 +121,29 @@ def transitions_(
                             for t in range(n):
                                 q += f * bank.F[m, i, s, t] * obj.P[i, k, t]
                     work.tx[s] = v
-                    work.var[s] = q
+                    work.var[s] = 1.0 / math.sqrt(max(q, bank.var_floor))
             intervals_(bank, j, work.tx, True, work)
             for c in range(bank.n_bounds[j]):
                 s = bank.bound_state[j, c]
                 if not bank.bound_mass[j, c] or (bank.entry_sources[i, j] >> s & 1):
                     continue
                 if not work.lower[c] < work.upper[c]:
-                    log_mass = -math.inf
+                    p = 0.0
                     break
-                sd = math.sqrt(max(work.var[s], bank.var_floor))
-                log_mass += normal_mass(
-                    (work.lower[c] - work.tx[s]) / sd, (work.upper[c] - work.tx[s]) / sd
-                )
-            if log_mass != 0.0:
-                obj.Pi[i, j] *= math.exp(log_mass)
-            total += obj.Pi[i, j]
-        for j in range(n_modes):
-            obj.Pi[i, j] = obj.Pi[i, j] / total if total > 1e-30 else bank.Pi[m, i, j]
+                if work.lower[c] > -np.inf or work.upper[c] < np.inf:
+                    p *= normal_probability(
+                        (work.lower[c] - work.tx[s]) * work.var[s],
+                        (work.upper[c] - work.tx[s]) * work.var[s],
+                    )
+            obj.Pi[i, j] = p
+            total += p
+        if total > 1e-30:
+            scale = 1.0 / total
+            for j in range(n_modes):
+                obj.Pi[i, j] *= scale
+        else:
+            for j in range(n_modes):
+                obj.Pi[i, j] = bank.Pi[m, i, j]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)

@@ -3,7 +3,7 @@
 Every measurement and every pseudo-measurement of the system has a diagonal noise covariance, so
 the vector update is done as a sequence of scalar ones.  That is algebraically the same (Bar-Shalom,
 Li, Kirubarajan 2001, section 7.2), needs no matrix inverse and skips a missing component for free.
-Each scalar update uses the Joseph form, so P stays symmetric and positive semi-definite.
+P stays symmetric by construction.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ def predict_(
             P[j, i] = P[i, j]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def update_row_(
     n: int, x: FloatArray, P: FloatArray, h: FloatArray, z: float, r: float, work: FloatArray
 ) -> tuple[float, float]:  # pragma: no cover - compiled
-    """Scalar measurement z = h x + v, v ~ N(0, r), in place in Joseph form.
+    """Scalar measurement z = h x + v, v ~ N(0, r), in place.
 
     Args:
         n: number of states, as in `predict_`.
@@ -81,26 +81,24 @@ def update_row_(
     s = r
     e = z
     for i in range(n):
-        a = 0.0
-        for k in range(n):
-            a += P[i, k] * h[k]
-        work[0, i] = a
-        s += h[i] * a
-        e -= h[i] * x[i]
+        work[0, i] = 0.0
+    # A row has two or three entries.
+    for k in range(n):
+        if h[k] != 0.0:
+            e -= h[k] * x[k]
+            for i in range(n):
+                work[0, i] += P[i, k] * h[k]
+    for i in range(n):
+        s += h[i] * work[0, i]
     if not (s > 0.0 and s < np.inf and abs(e) < np.inf):
         return e, np.nan
+    g = 1.0 / s
     for i in range(n):
-        work[1, i] = work[0, i] / s
+        work[1, i] = work[0, i] * g
         x[i] += work[1, i] * e
-    # Joseph form for one row: P - K (hP) - (hP)' K' + K s K' with K = hP/s, kept symmetric.
     for i in range(n):
         for j in range(i + 1):
-            v = (
-                P[i, j]
-                - work[1, i] * work[0, j]
-                - work[0, i] * work[1, j]
-                + work[1, i] * s * work[1, j]
-            )
+            v = P[i, j] - work[1, i] * work[0, j]
             P[i, j] = v
             P[j, i] = v
     return e, s
@@ -110,23 +108,26 @@ def update_row_(
 def update_state_(
     n: int, x: FloatArray, P: FloatArray, i0: int, z: float, r: float, work: FloatArray
 ) -> tuple[float, float]:  # pragma: no cover - compiled
-    """`update_row_` for a row that selects the single state ``i0``; several times cheaper."""
+    """`update_row_` for a row that selects the single state ``i0``; several times cheaper.
+
+    The row of the state itself is scaled by r / s, which is where the Joseph form's digits matter.
+    """
     s = P[i0, i0] + r
     e = z - x[i0]
     if not (s > 0.0 and s < np.inf and abs(e) < np.inf):
         return e, np.nan
+    g = 1.0 / s
     for i in range(n):
         work[0, i] = P[i, i0]
-        work[1, i] = P[i, i0] / s
+        work[1, i] = P[i, i0] * g
         x[i] += work[1, i] * e
     for i in range(n):
         for j in range(i + 1):
-            v = (
-                P[i, j]
-                - work[1, i] * work[0, j]
-                - work[0, i] * work[1, j]
-                + work[1, i] * s * work[1, j]
-            )
+            v = P[i, j] - work[1, i] * work[0, j]
             P[i, j] = v
             P[j, i] = v
+    for i in range(n):
+        v = work[1, i] * r
+        P[i, i0] = v
+        P[i0, i] = v
     return e, s

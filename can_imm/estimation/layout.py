@@ -15,6 +15,9 @@ NEGLIGIBLE_WEIGHT = 1e-12
 UNREACHABLE = 1e-15
 """A mode whose prior probability is smaller is not computed; it gets the floor probability."""
 
+NEGLIGIBLE_RISE = 0.01
+"""A mode that stays below this fraction of the floor, whatever the measurement, is not computed."""
+
 MAX_ROWS = 4
 """Largest number of constraint rows of one kind in one mode."""
 
@@ -142,6 +145,7 @@ WORK_DTYPE = np.dtype(
         ("angle", np.float64),
         ("elapsed", np.float64),
         ("source", np.int64, (_M,)),
+        ("order", np.int64, (_M,)),
     ],
     align=True,
 )

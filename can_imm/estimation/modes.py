@@ -18,11 +18,12 @@ import numpy as np
 from can_imm.estimation.constraints import (
     LOG_MASS_FLOOR,
     interval_mass,
+    normal_probability,
     project_,
     truncate_,
 )
 from can_imm.estimation.interaction import intervals_, reference
-from can_imm.estimation.kalman import log_normal, update_row_, update_state_
+from can_imm.estimation.kalman import LOG_2PI, update_row_, update_state_
 from can_imm.estimation.layout import LOG_FLOOR
 from can_imm.estimation.noise import NoiseState, load, store_, uniform
 from can_imm.estimation.particles import (
@@ -30,11 +31,12 @@ from can_imm.estimation.particles import (
     cholesky4_,
     enter_,
     moments_,
+    moved_,
     propagate_,
     resample_,
     weigh_,
 )
-from can_imm.types import AX, FloatArray
+from can_imm.types import AX, VX, VY, FloatArray, Y
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -84,16 +86,21 @@ def correct_(
     Returns:
         Log density of z; NaN on a numeric failure.
     """
-    log_l = 0.0
     cos, sin = 1.0, 0.0
     if angle != 0.0:
         cos, sin = math.cos(angle), math.sin(angle)
+    # one logarithm for all components
+    square = 0.0
+    product = 1.0
+    count = 0
     for c in range(4):
         if not valid[c]:
             continue
+        count += 1
         if age == 0.0 and angle == 0.0:
             e, v = update_state_(n, x, P, c, z[c], r[c], row)
-            log_l += log_normal(e, v)
+            square += e * e / v
+            product *= v
             continue
         for s in range(n):
             h[s] = 0.0
@@ -114,8 +121,9 @@ def correct_(
                 if a < n:
                     h[a] = -age * share
         e, v = update_row_(n, x, P, h, z[c], r[c], row)
-        log_l += log_normal(e, v)
-    return log_l
+        square += e * e / v
+        product *= v
+    return -0.5 * (count * LOG_2PI + math.log(product) + square)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -129,12 +137,14 @@ def mass_(
     """
     if n_bounds == 0:
         return 0.0
+    last = n_bounds - 1
+    if last == 0:
+        return interval_mass(x, P, state[0], work.lower[0], work.upper[0])
     for s in range(n):
         work.tx[s] = x[s]
         for t in range(n):
             work.tP[s, t] = P[s, t]
     log_mass = 0.0
-    last = n_bounds - 1
     for c in range(last):
         log_mass += truncate_(
             n, work.tx, work.tP, state[c], work.lower[c], work.upper[c], floor, work.row
@@ -179,6 +189,8 @@ def update_mode_(
         s = bank.bound_state[j, c]
         lower = work.lower[c]
         upper = work.upper[c]
+        if lower == -np.inf and upper == np.inf:
+            continue  # one interval with another row
         if not bank.is_projected[j]:
             posterior += truncate_(n, x, P, s, lower, upper, bank.var_floor, work.row)
         elif x[s] < lower:
@@ -197,6 +209,56 @@ def keep_combined_(
         x[s] = obj.mean[s]
         for t in range(n):
             P[s, t] = obj.cov[s, t]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def particle_limit(
+    bank: Any,
+    obj: Any,
+    work: Any,
+    j: int,
+    m: int,
+    z: FloatArray,
+    r: FloatArray,
+    valid: Any,
+    age: float,
+) -> float:  # pragma: no cover - compiled
+    """Log of a bound on what the particles can say, over the peak density of the measurement.
+
+    Their speed is that of the profile, from f_min to the peak; their lateral position is normal
+    for each source, and has to lie in the window.  What x and vy say is not looked at.
+    ``work.w`` holds the mixing weights.  The measurement's axes must not be turned.
+    """
+    par = bank.particle
+    if work.angle != 0.0:
+        return 0.0
+    limit = 0.0
+    if valid[VX]:
+        v = r[VX] + par.std_profile**2
+        e = max(par.f_min - z[VX], z[VX] - par.peak_high, 0.0)
+        limit = -0.5 * (e * e / v + math.log(v / r[VX]))
+    tau = m * bank.step_s
+    share = 0.0
+    for i in range(bank.n_modes):
+        if work.w[i] == 0.0:
+            continue
+        if i == j:
+            share += work.w[i]  # nothing is known of the own particles but that they are inside
+            continue
+        # y and vy at the end of the step, and y at the measurement, which is y - age vy
+        moved_(obj.x[i], obj.P[i], tau, par, work.tx, work.tP)
+        y, yy, yv, vv = work.tx[1], work.tP[1, 1], work.tP[2, 1], work.tP[2, 2]
+        p = 1.0
+        if valid[Y]:
+            s = yy - age * (2.0 * yv - age * vv) + r[Y]
+            gain = (yy - age * yv) / s
+            e = z[Y] - y + age * obj.x[i, VY]
+            y += gain * e
+            yy -= gain * gain * s
+            p = math.exp(-0.5 * e * e / s) * math.sqrt(r[Y] / s)
+        sd = math.sqrt(max(yy, bank.var_floor))
+        share += work.w[i] * p * normal_probability((par.y_low - y) / sd, (par.y_high - y) / sd)
+    return limit + math.log(share)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -222,33 +284,38 @@ def update_particles_(
     transition), not a soft overlap.
     """
     n_modes, n = bank.n_modes, bank.n_states
-    total = particles.shape[0]
+    total = particles.shape[1]
     x = work.x[j]
     P = work.P[j]
-    # systematic allocation of the particles to the sources
-    done = 0
-    cumulative = 0.0
+    tau = m * bank.step_s
+    # systematic allocation of the particles to the sources: the mode itself, then the others
+    last = j  # takes what rounding leaves over
+    for i in range(n_modes):
+        if i != j and work.w[i] > 0.0:
+            last = i
     words = load(noise)
     u, words = uniform(words)
     store_(noise, words)
+    cumulative = work.w[j]
+    done = min(int(cumulative * total + u), total) if last != j else total
+    if done > 0:
+        # they are equally weighted after resampling: take evenly spaced ones
+        spacing = total / done
+        for c in range(N_COLUMNS):
+            for k in range(done):
+                spare[c, k] = particles[c, int(k * spacing)]
+        propagate_(spare, spare[N_COLUMNS:], done, tau, bank.particle, noise)
     for i in range(n_modes):
-        cumulative += work.w[i]
-        upto = min(int(cumulative * total + u), total) if i < n_modes - 1 else total
-        count = upto - done
-        if count <= 0:
+        if i == j or work.w[i] == 0.0:
             continue
-        if i == j:
-            # own particles are equally weighted after resampling: take evenly spaced ones
-            for k in range(count):
-                a = (k * total) // count
-                for c in range(N_COLUMNS):
-                    spare[done + k, c] = particles[a, c]
-        else:
-            cholesky4_(obj.P[i], work.L)
-            enter_(spare, done, count, obj.x[i], work.L, bank.particle, noise)
-        done = upto
-    propagate_(spare, m * bank.step_s, bank.particle, noise)
-    log_l = weigh_(spare, weights, z, r, valid, age, bank.particle)
+        cumulative += work.w[i]
+        upto = min(int(cumulative * total + u), total) if i != last else total
+        if upto > done:
+            moved_(obj.x[i], obj.P[i], tau, bank.particle, work.tx, work.tP)
+            cholesky4_(work.tP, work.L)
+            enter_(spare, done, upto - done, work.tx, work.L, bank.particle, noise)
+            done = upto
+    log_l = weigh_(spare, weights, z, r, valid, age, work.angle, bank.particle)
     for s in range(n):
         for t in range(n):
             P[s, t] = 0.0

@@ -72,17 +72,18 @@ heading [rad], turning against the road [rad/s], curvature [1/m], its change [1/
 [rad/s] and mounting [rad]: how large they get; ``*_time`` [s] and ``*_length`` [m]: how long they
 stay the same; ``yaw_noise`` [rad/√s] of the heading from the yaw rate, and without it; ``drift``
 [m/√s] of the offset; ``wander_std`` [m] and ``wander_time`` [s] of a vehicle in its lane;
-``freedom`` [m/√s] of its place, and while it changes lanes; ``far_curvature`` [1/m]: how differently
-the road may bend beyond `FAR`; ``*_weight``: by how much
-more the variances of this estimate count than those of white noise, since its errors last;
+``freedom`` [m/√s] of its place, and while it changes lanes; ``far_curvature`` [1/m]: how
+differently the road may bend beyond `FAR`; ``*_weight``: by how much more the variances of this
+estimate count than those of white noise, since its errors last;
 ``*_most`` [m, m/s]: no larger error is added to the measurements' noise: however little is known of
 where the lanes are far ahead, that a vehicle moves across them is seen.
 """
 (
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,
     P_TURN_STD, P_TURN_TIME, P_CURVATURE_STD, P_CURVATURE_LENGTH, P_CHANGE_STD, P_CHANGE_LENGTH,
-    P_FAR_CURVATURE, P_BIAS_STD, P_MOUNTING_STD, P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_WANDER_STD,
-    P_WANDER_TIME, P_FREEDOM, P_FREEDOM_CHANGING, P_ERROR_WEIGHT, P_ERROR_MOST, P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST,
+    P_FAR_CURVATURE, P_BIAS_STD, P_MOUNTING_STD, P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT,
+    P_WANDER_STD, P_WANDER_TIME, P_FREEDOM, P_FREEDOM_CHANGING, P_ERROR_WEIGHT, P_ERROR_MOST,
+    P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST,
 ) = range(len(PARAMETERS))  # fmt: skip
 
 USUAL_SPEED = 25.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from can_imm.bus.frame import Frame
@@ -24,11 +24,30 @@ GUARD_NS = 2_000_000
 """How long after ``t_k`` [ns] a live step waits for frames that are still on their way."""
 
 
+REHEARSE_S = 600e-6
+"""So long before a live step with frames [s] it is rehearsed: what a step needs is in none of the
+processor's caches after some milliseconds of other work."""
+
+AWAKE_S = 80e-6
+"""So long before such a step [s] the loop stops sleeping, for waking up takes that time."""
+
+Rehearsal = Callable[[int, list[Frame]], None]
+
+
+def _nothing(t_ns: int, frames: list[Frame]) -> None:
+    pass
+
+
 class Feed(Protocol):
-    """Frames for a loop, step by step."""
+    """Frames for a loop, step by step.
+
+    ``rehearse``, set by the loop, is called before the first step, and shortly before a live step
+    that has frames, with these.
+    """
 
     clock: Clock
     guard_ns: int
+    rehearse: Rehearsal
 
     def start_ns(self, step_ns: int) -> int:
         """Return the time of the first step [ns], a multiple of ``step_ns``; called once."""
@@ -66,6 +85,7 @@ class BusFeed:
         self, source: FrameSource, clock: Clock, health: Health, guard_ns: int = GUARD_NS
     ) -> None:
         self.clock = clock
+        self.rehearse: Rehearsal = _nothing
         self._source = source
         self._health = health
         self.guard_ns = guard_ns
@@ -75,14 +95,25 @@ class BusFeed:
         self._foreign = False
 
     def start_ns(self, step_ns: int) -> int:
+        self.rehearse(0, [])
         self._done_ns = self.clock.now_ns() // step_ns * step_ns
         return self._done_ns
 
     def collect(self, t_ns: int) -> list[Frame]:
         due_ns = t_ns + self.guard_ns
+        rehearsed = False
         while True:
-            remaining_s = self.clock.remaining_s(due_ns)
-            frame = self._source.recv(max(remaining_s, 0.0))
+            remaining_s = timeout_s = self.clock.remaining_s(due_ns)
+            if self._pending and self._pending[0].t_ns <= t_ns:
+                if rehearsed:
+                    timeout_s -= AWAKE_S
+                elif remaining_s > REHEARSE_S:
+                    timeout_s -= REHEARSE_S
+                elif remaining_s > 2 * AWAKE_S:
+                    rehearsed = True
+                    self.rehearse(t_ns, list(self._pending))
+                    continue
+            frame = self._source.recv(max(timeout_s, 0.0))
             if frame is None:
                 if remaining_s <= 0:
                     break
@@ -141,6 +172,7 @@ class LogFeed:
         replaced: frozenset[int] = frozenset(),
     ) -> None:
         self.clock = clock
+        self.rehearse: Rehearsal = _nothing
         self.guard_ns = 0
         self.n_replaced = 0
         self._frames = iter(frames)
@@ -161,12 +193,15 @@ class LogFeed:
             time.sleep(remaining_s)
         mine = []
         frame: Frame | None = self._next
+        frames, replaced = self._frames, self._replaced
         while frame is not None and frame.t_ns <= t_ns:
-            if frame.id in self._replaced:
+            if frame.id in replaced:
                 self.n_replaced += 1
             else:
                 mine.append(frame)
-            frame = self._read()
+            frame = next(frames, None)
+            if frame is not None and (self._offset_ns or frame.t_ns < self._earliest_ns):
+                frame = self._in_order(frame)
         self._next = frame
         self._earliest_ns = t_ns + LATE_NS
         return mine
@@ -174,10 +209,8 @@ class LogFeed:
     def next_ns(self) -> int:
         return 0 if self._next is None else self._next.t_ns
 
-    def _read(self) -> Frame | None:
-        frame = next(self._frames, None)
-        if frame is None:
-            return None
+    def _in_order(self, frame: Frame) -> Frame:
+        """The frame with a time that does not run backwards."""
         t_ns = frame.t_ns + self._offset_ns
         if t_ns < self._earliest_ns - JUMP_NS:
             self._health.clock_jumps += 1
@@ -194,6 +227,7 @@ class IdleFeed:
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
+        self.rehearse: Rehearsal = _nothing
         self.guard_ns = 0
 
     def start_ns(self, step_ns: int) -> int:

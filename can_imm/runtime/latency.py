@@ -20,7 +20,7 @@ from can_imm.bus.echo import ECHO_ANSWER, ECHO_REQUEST
 from can_imm.bus.encoder import OUTPUT_IDS, STATUS_ID
 from can_imm.bus.frame import Frame
 from can_imm.runtime.clock import Clock
-from can_imm.runtime.feeds import FrameSource
+from can_imm.runtime.feeds import FrameSource, Rehearsal
 from can_imm.runtime.loop import Node, Sink
 
 if TYPE_CHECKING:
@@ -181,6 +181,9 @@ class _Detector:
     def n_tracked(self) -> int:
         return self._detector.n_tracked
 
+    def understudy(self) -> Detector:
+        return self._detector.understudy()
+
     def step(self, t_ns: int, scan: Scan | None) -> int:
         self._probe.detector_begins(scan)
         n = self._detector.step(t_ns, scan)
@@ -191,6 +194,11 @@ class _Detector:
 class _Node:
     def __init__(self, probe: Probe, node: Node) -> None:
         self._probe, self._node = probe, node
+
+    def rehearse(self, t_ns: int, frames: list[Frame]) -> None:
+        rehearse: Rehearsal | None = getattr(self._node, "rehearse", None)
+        if rehearse is not None:
+            rehearse(t_ns, frames)
 
     def step(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
         self._probe.step_begins(t_ns)

@@ -54,6 +54,8 @@ class Loop:
     ) -> None:
         self._feed = feed
         self._node = node
+        # not every node has something to rehearse
+        feed.rehearse = getattr(node, "rehearse", feed.rehearse)
         self._health = health
         self._outputs = outputs
         self._recorders = recorders

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy.typing as npt
@@ -23,6 +24,9 @@ SENSOR_TIMEOUT_NS = 1_000_000_000
 
 MAX_WAITING = 8
 """Scans that may wait for their step when several come at once."""
+
+REHEARSED = 4
+"""So many frames of a step are rehearsed."""
 
 S = TypeVar("S", Scan, DetectionScan)
 T = TypeVar("T", bound="Timed")
@@ -121,6 +125,7 @@ class DetectorNode:
         self._encoder = encoder
         self._health = health
         self._listeners = listeners
+        self._understudy: DetectorNode | None = None
         self._waiting = Waiting([Scan(capacity) for _ in range(MAX_WAITING)])
         # answers go where the sensor's frames came from
         self._channel: str | None = None
@@ -146,19 +151,29 @@ class DetectorNode:
             self._waiting.done(scan)
             self._seen_ns = t_ns
             reports = self.detector.reports[:n]
-            answers += self._encoder.encode(reports, t_ns)
+            answers += self._encoder.encode(reports, t_ns, self._channel)
             for listener in self._listeners:
                 listener(t_ns, reports)
         if self._every_step and n == 0:
             predicted = self.detector.predicted[: self.detector.predict(t_ns)]
-            answers += self._encoder.estimates(predicted, t_ns)
+            answers += self._encoder.estimates(predicted, t_ns, self._channel)
         if self._status_ns is None or t_ns >= self._status_ns + self._encoder.status_period_ns:
             self._status_ns = t_ns
-            answers.append(self._encoder.status(t_ns, self._status(t_ns)))
-        if self._channel is not None:
-            channel = self._channel
-            answers = [Frame(t_ns, frame.id, frame.data, channel) for frame in answers]
+            status = self._encoder.status(t_ns, self._status(t_ns))
+            answers.append(status._replace(channel=self._channel))
         return answers
+
+    def rehearse(self, t_ns: int, frames: list[Frame]) -> None:
+        """Do a step on copies of everything and forget it: shortly before the real one that
+        fetches code and tables into the processor's caches.  The first call makes the copies."""
+        understudy = getattr(self.detector, "understudy", None)
+        if understudy is None:
+            return  # a stand-in for a detector
+        if self._understudy is None:
+            self._understudy = DetectorNode(
+                deepcopy(self.decoder), understudy(), ManoeuvreEncoder(), Health()
+            )
+        self._understudy.step(t_ns, frames[:REHEARSED])
 
     def farewell(self, t_ns: int) -> list[Frame]:
         """Return the last frame of a detector that ends: DetectorStatus, state Stopping."""

@@ -24,10 +24,10 @@ from can_imm.bus.reference import Reference
 from can_imm.bus.sinks import LogSink
 from can_imm.bus.sources import LogSource
 from can_imm.detector import Detector
-from can_imm.estimation import imm, layout
-from can_imm.estimation.entry import entry_point
+from can_imm.estimation import layout
+from can_imm.estimation.entry import Processor
 from can_imm.estimation.noise import noise_state
-from can_imm.estimation.particles import N_COLUMNS
+from can_imm.estimation.particles import N_COLUMNS, N_SCRATCH
 from can_imm.manoeuvres import PRESETS, ModeBank, bank_from_dict
 from can_imm.runtime.clock import FastClock
 from can_imm.runtime.feeds import LogFeed
@@ -36,7 +36,7 @@ from can_imm.runtime.loop import Loop
 from can_imm.runtime.nodes import DetectorNode
 from can_imm.studies.peer import imm_peer
 from can_imm.studies.runs import play
-from can_imm.types import FloatArray, Scan
+from can_imm.types import FloatArray, IntArray, Scan
 
 STEPS = 10
 """Steps of the loop between two measurements: 0.1 s."""
@@ -190,35 +190,44 @@ class Estimator:
 
     def __init__(self, bank: ModeBank, n: int) -> None:
         assert bank.measurement_variance is not None
-        z = _measurements()
-        self._scans = [np.repeat(row[None], n, 0) for row in z]
-        objects = np.zeros(n, layout.OBJECT_DTYPE)
-        tail = (
-            np.tile(bank.measurement_variance, (n, 1)),
-            np.ones((n, 4), np.bool_),
-            np.zeros(n),
-            layout.UNKNOWN_GROUND,
-            0.0,
-            0.0,
+        self.scans = [np.repeat(row[None], n, 0) for row in _measurements()]
+        self.objects = np.zeros(n, layout.OBJECT_DTYPE)
+        self._steps: IntArray = np.zeros(n, np.int32)
+        self._z: FloatArray = np.zeros((n, 4))
+        self._n = n
+        self._processor = Processor(
             np.inf,
-            np.zeros((n, bank.n_particles, N_COLUMNS)),
-            np.zeros((bank.n_particles, N_COLUMNS)),
-            np.zeros(bank.n_particles),
-            noise_state(np.random.default_rng(0)),
-            np.zeros(n, np.int8),
+            bank=bank.record,
+            objects=self.objects,
+            work=np.zeros(1, layout.WORK_DTYPE),
+            slot=np.arange(n, dtype=np.int32),
+            steps=self._steps,
+            z=self._z,
+            r=np.tile(bank.measurement_variance, (n, 1)),
+            valid=np.ones((n, 4), np.bool_),
+            angle=np.zeros(n),
+            particles=np.zeros((n, N_COLUMNS, bank.n_particles)),
+            spare=np.zeros((N_SCRATCH, bank.n_particles)),
+            weights=np.zeros(bank.n_particles),
+            noise=noise_state(np.random.default_rng(0)),
+            status=np.zeros(n, np.int8),
         )
-        slot, new = np.arange(n, dtype=np.int32), np.full(n, -1, np.int32)
-        head = (bank.record, objects, np.zeros(1, layout.WORK_DTYPE), n, slot)
-        self._birth = (*head, new, self._scans[0], *tail)
-        self._head, self._tail = (*head, np.full(n, STEPS, np.int32)), tail
-        self._step = entry_point(imm.process_scan_, *self._birth)
 
     def run(self) -> None:
         """A birth and the cycles after it."""
-        step, head, tail = self._step, self._head, self._tail
-        step(*self._birth)
-        for z in self._scans[1:]:
-            step(*head, z, *tail)
+        for _ in self.steps():
+            pass
+
+    def steps(self) -> Iterator[FloatArray]:
+        """The birth and the cycles one by one; gives the measurements (n, 4) of each."""
+        process, address, n, z = self._processor.run, self._processor.address, self._n, self._z
+        self._steps[:] = -1
+        for k, row in enumerate(self.scans):
+            z[:] = row
+            process(address, n, layout.UNKNOWN_GROUND, 0.0, 0.0)
+            if k == 0:
+                self._steps[:] = STEPS
+            yield row
 
 
 def _filterpy(bank: ModeBank) -> None:

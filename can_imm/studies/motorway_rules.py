@@ -103,6 +103,13 @@ RULES: dict[str, Rules] = {
         receding=0.35, receding_end=0.233, approaching=0.5, approaching_end=0.245, speed_dwell=1,
         rear_end_x=10.0, stationary=3.0, oncoming=3.0,
     ),
+    "esr": Rules(
+        q_along=0.125, q_across=0.112, curvature=0.0, yaw_tau=2.63, common=1.0, width=3.6,
+        lane_vy=0.622, lane_vy_far=0.308, lane_border=0.0598, border_x=23.4, lane_end=1.04,
+        lane_dwell=3, lane_hold=1,
+        receding=0.313, receding_end=0.235, approaching=0.371, approaching_end=0.323, speed_dwell=1,
+        rear_end_x=9.97, stationary=3.0, oncoming=3.0,
+    ),
 }  # fmt: skip
 """By profile, for all roads."""
 PLAIN_RULES: dict[str, Rules] = {
@@ -133,6 +140,13 @@ PLAIN_RULES: dict[str, Rules] = {
         lane_dwell=1, lane_hold=1,
         receding=0.287, receding_end=0.185, approaching=0.268, approaching_end=0.158, speed_dwell=1,
         rear_end_x=9.97, stationary=3.0, oncoming=3.0,
+    ),
+    "esr": Rules(
+        q_along=0.247, q_across=0.3, curvature=0.0, yaw_tau=1.4, common=0.5, width=3.6,
+        lane_vy=0.6, lane_vy_far=0.1, lane_border=0.4, border_x=50.0, lane_end=0.75,
+        lane_dwell=2, lane_hold=1,
+        receding=0.367, receding_end=0.212, approaching=0.333, approaching_end=0.124, speed_dwell=1,
+        rear_end_x=10.0, stationary=3.0, oncoming=3.0,
     ),
 }  # fmt: skip
 """By profile, for straight roads and a constant speed of the ego."""

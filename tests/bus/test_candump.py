@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_imm.bus.candump import dropped, format_frame, parse
+from can_imm.bus.candump import _parse_slowly, dropped, format_frame, parse
 from can_imm.bus.frame import BRS, DLC_SHIFT, ERROR, ESI, EXTENDED, FD, REMOTE, TX, Frame
 
 T = 1_700_000_000_123_456_000
@@ -123,3 +123,18 @@ def test_python_can_reads_the_same(frame):
 def test_no_text_is_too_strange(text):
     parse(text)
     dropped(text)
+
+
+@given(
+    st.from_regex(r"\(\d{0,13}[.,]?\d{5,7}\)?", fullmatch=True),
+    st.sampled_from(["can0", "", "x y", "#"]),
+    st.from_regex(r"(210|7fF|2_1|0x2| 21|800|12345678)[#]?[0-9A-Fa-f_ g]{0,18}", fullmatch=True),
+    st.sampled_from(["", " R", " T", " r", "\r\n", " R\n", " X", " R R"]),
+)
+def test_the_short_way_and_the_patterns_agree(time, channel, body, end):
+    line = f"{time} {channel} {body}{end}"
+    slow = _parse_slowly(line)
+    _parse_slowly("(0.000000) c 210#"), _parse_slowly("(0.000000) c 7fF#")
+    assert parse(line) == slow
+    known = Frame(12_345_678_000, 0x210, b"\xab" * 4, "can0")
+    assert parse(f"(12.345678) can0 210#{'AB' * 4} R\n") == known

@@ -10,7 +10,7 @@ from oracles.imm import Imm, Mode
 
 from can_imm.estimation import imm, layout
 from can_imm.estimation.noise import noise_state
-from can_imm.estimation.particles import N_COLUMNS
+from can_imm.estimation.particles import N_COLUMNS, N_SCRATCH
 
 
 def blank(n_modes: int, n_states: int) -> np.ndarray[Any, Any]:
@@ -76,8 +76,8 @@ class Runner:
         self.bank = bank
         self.objects = np.zeros(capacity, layout.OBJECT_DTYPE)
         self.work = np.zeros(1, layout.WORK_DTYPE)
-        self.particles = np.zeros((capacity, n_particles, N_COLUMNS))
-        self.spare = np.zeros((n_particles, N_COLUMNS))
+        self.particles = np.zeros((capacity, N_COLUMNS, n_particles))
+        self.spare = np.zeros((N_SCRATCH, n_particles))
         self.weights = np.zeros(n_particles)
         self.noise = noise_state(np.random.default_rng(seed))
 

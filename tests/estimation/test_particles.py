@@ -72,7 +72,7 @@ def test_weights_are_constraint_times_density(seed: int, age: float, mask: int) 
     seen = p[:, :4] - age * p[:, [1, 1, 3, 3]] * [1.0, 0.0, 1.0, 0.0]
     g = norm.pdf(z, seen, np.sqrt(r))[:, valid].prod(axis=1)
     w = np.empty(n)
-    log_l = weigh_(p, w, z, r, valid, age, parameters())
+    log_l = weigh_(p.T.copy(), w, z, r, valid, age, 0.0, parameters())
     assert log_l == pytest.approx(math.log(np.mean(phi * g)), rel=1e-10)
     np.testing.assert_allclose(w, phi * g / (phi * g).sum(), rtol=1e-9, atol=1e-300)
 
@@ -80,16 +80,16 @@ def test_weights_are_constraint_times_density(seed: int, age: float, mask: int) 
 def test_no_feasible_particle() -> None:
     p = np.zeros((5, N_COLUMNS))
     p[:, LENGTH] = 1.0
-    assert weigh_(p, np.empty(5), np.zeros(4), np.ones(4), VALID, 0.0, parameters()) == -np.inf
+    log_l = weigh_(p.T.copy(), np.empty(5), np.zeros(4), np.ones(4), VALID, 0.0, 0.0, parameters())
+    assert log_l == -np.inf
 
 
 def test_weights_of_an_extreme_measurement_do_not_underflow() -> None:
     p = np.tile([52.0, 2.0, 2.0, 0.0, 50.0, 2.1, 3.75], (4, 1))
     p[1, PX] = 52.5
     w = np.empty(4)
-    log_l = weigh_(
-        p, w, np.array([100.0, 2.0, 2.0, 0.0]), np.full(4, 0.1), VALID, 0.0, parameters()
-    )
+    z, r = np.array([100.0, 2.0, 2.0, 0.0]), np.full(4, 0.1)
+    log_l = weigh_(p.T.copy(), w, z, r, VALID, 0.0, 0.0, parameters())
     assert log_l < -1000.0
     assert w == pytest.approx([0.0, 1.0, 0.0, 0.0], abs=1e-9)
 
@@ -99,7 +99,7 @@ def test_moments(seed: int) -> None:
     rng = np.random.default_rng(seed)
     p, w = rng.normal(3.0, 2.0, (30, N_COLUMNS)), rng.dirichlet(np.ones(30))
     x, P = np.empty(4), np.empty((4, 4))
-    particles.moments_(p, w, x, P)
+    particles.moments_(p.T.copy(), w, x, P)
     np.testing.assert_allclose(x, np.average(p[:, :4], axis=0, weights=w), rtol=1e-12)
     expected = np.cov(p[:, :4].T, aweights=w, bias=True)
     np.testing.assert_allclose(P, expected, rtol=1e-9, atol=1e-12)
@@ -112,45 +112,75 @@ def test_resampling_is_systematic(seed: int, u: float) -> None:
     n, count = 20, 50
     p = np.repeat(np.arange(float(n))[:, None], N_COLUMNS, axis=1)
     w = rng.dirichlet(np.full(n, 0.3))
-    out = np.empty((count, N_COLUMNS))
-    particles.resample_(p, w, out, count, u)
-    taken = np.bincount(out[:, 0].astype(int), minlength=n)
+    out = np.empty((N_COLUMNS, count))
+    particles.resample_(p.T.copy(), w, out, count, u)
+    taken = np.bincount(out[0].astype(int), minlength=n)
     assert (np.abs(taken - count * w) < 1.0 + 1e-9).all()
-    assert (np.diff(out[:, 0]) >= 0).all()
+    assert (np.diff(out[0]) >= 0).all()
+    assert (out == out[0]).all()
 
 
 def test_resampling_survives_weights_that_sum_to_less_than_one() -> None:
     p = np.repeat(np.arange(3.0)[:, None], N_COLUMNS, axis=1)
-    out = np.empty((4, N_COLUMNS))
-    particles.resample_(p, np.array([0.5, 0.5 - 1e-9, 0.0]), out, 4, 1.0 - 1e-16)
-    assert np.isin(out[:, 0], [0.0, 1.0, 2.0]).all()
+    out = np.empty((N_COLUMNS, 4))
+    particles.resample_(p.T.copy(), np.array([0.5, 0.5 - 1e-9, 0.0]), out, 4, 1.0 - 1e-16)
+    assert np.isin(out[0], [0.0, 1.0, 2.0]).all()
 
 
-def test_entering_draws_from_the_source() -> None:
-    rng = np.random.default_rng(0)
-    x, P = np.array([50.0, 1.0, 0.5, 0.3]), gaussian.random_covariance(rng, 4)
-    p = np.full((40_000 + 2, N_COLUMNS), 77.0)
-    L = np.zeros((4, 4))
-    particles.cholesky4_(P, L)
-    np.testing.assert_allclose(L @ L.T, P, rtol=1e-12)
-    par = parameters(
-        absolute=0, peak_low=1.0, peak_high=3.0, length_low=1.2, length_high=2.4, entry_vy_std=0.5
-    )
-    enter_(p, 1, 40_000, x, L, par, noise_state(rng))
-    assert (p[[0, -1]] == 77.0).all()
-    p = p[1:-1]
+ENTERING = {"absolute": 0, "peak_low": 1.0, "peak_high": 3.0, "length_low": 1.2,
+            "length_high": 2.4, "entry_vy_std": 0.5}  # fmt: skip
+
+
+def entered(x: np.ndarray, P: np.ndarray, tau: float, par: Any, n: int) -> np.ndarray:
+    """(7, n) particles that entered from N(x, P) and moved on for ``tau`` seconds."""
+    p = np.full((N_COLUMNS, n + 2), 77.0)
+    mean, cov, L = np.zeros(4), np.zeros((4, 4)), np.zeros((4, 4))
+    particles.moved_(x, P, tau, par, mean, cov)
+    particles.cholesky4_(cov, L)
+    np.testing.assert_allclose(L @ L.T, np.tril(cov) + np.tril(cov, -1).T, rtol=1e-12)
+    enter_(p, 1, n, mean, L, par, noise_state(np.random.default_rng(0)))
+    assert (p[:, [0, -1]] == 77.0).all()
+    return p[:, 1:-1]
+
+
+@pytest.mark.parametrize("absolute", [0, 1])
+def test_entering_draws_from_the_source_moved_on(absolute: int) -> None:
+    x = np.array([50.0, 1.0, 0.5, 0.3])
+    P = gaussian.random_covariance(np.random.default_rng(0), 4)
+    tau, par = 0.4, parameters(**{**ENTERING, "absolute": absolute})
+    p = entered(x, P, tau, par, 40_000)
     P[3, 3] += 0.25
-    np.testing.assert_allclose(p[:, :4].mean(axis=0), x, atol=0.04)
-    np.testing.assert_allclose(np.cov(p[:, :4].T), P, atol=0.06)
-    assert p[:, PEAK].min() >= 1.0
-    assert p[:, PEAK].max() <= 3.0
-    ratio = p[:, LENGTH] / p[:, PEAK]
+    F = np.eye(4)
+    F[0, 1] = F[2, 3] = tau
+    G = np.array([0.0, 0.0, 0.5 * tau, 1.0])
+    cov = F @ P @ F.T + np.outer(G, G) * 1.0 * tau + np.diag([0.05**2 * tau, 0.0, 0.0, 0.0])
+    seen = [0, 2, 3]
+    np.testing.assert_allclose(p[seen].mean(axis=1), (F @ x)[seen], atol=0.04)
+    np.testing.assert_allclose(np.cov(p[seen]), cov[np.ix_(seen, seen)], atol=0.06)
+    residual = p[PVX] - [profile_speed(a[PX] - a[ENTRY], a[PEAK], a[LENGTH], par["up"], par["down"])
+                         for a in p.T]  # fmt: skip
+    assert residual.mean() == pytest.approx(0.0, abs=0.01)
+    assert residual.std() == pytest.approx(0.3, rel=0.03)
+
+
+def test_where_it_enters() -> None:
+    """On the profile, where that is feasible and still rising or flat; its speed there is its own,
+    and in ``tau`` it has gained what its old speed made it gain."""
+    x, P = np.array([50.0, 1.5, 0.5, 0.3]), np.diag([4.0, 1e-12, 1.0, 1.0])
+    tau, par = 0.4, parameters(**ENTERING, std_x=0.0)
+    p = entered(x, P, tau, par, 40_000)
+    assert p[PEAK].min() >= 1.0
+    assert p[PEAK].max() <= 3.0
+    ratio = p[LENGTH] / p[PEAK]
     assert ratio.min() >= 1.2 - 1e-12
     assert ratio.max() <= 2.4 + 1e-12
-    # it enters where the profile is feasible and still rising or flat
-    f = [profile_speed(a[PX] - a[ENTRY], a[PEAK], a[LENGTH], par["up"], par["down"]) for a in p]
-    assert min(f) >= 0.4 - 1e-9
-    assert ((p[:, PX] - p[:, ENTRY]) / p[:, LENGTH]).max() <= par["down"] + 1e-12
+    gained = p[PX] - tau * 1.5 - p[ENTRY]
+    f = [
+        profile_speed(g, a[PEAK], a[LENGTH], par["up"], par["down"])
+        for g, a in zip(gained, p.T, strict=True)
+    ]
+    assert min(f) >= 0.4 - 1e-5
+    assert (gained / p[LENGTH]).max() <= par["down"] + 1e-5
 
 
 def test_the_factor_of_a_singular_covariance_is_finite() -> None:
@@ -170,7 +200,9 @@ def test_motion() -> None:
     tau, n = 0.1, 40_000
     p = np.tile([51.0, 1.5, 1.0, 0.8, 50.0, 2.1, 3.75], (n, 1))
     par = parameters()
-    particles.propagate_(p, tau, par, noise_state(rng))
+    columns = p.T.copy()
+    particles.propagate_(columns, np.empty((3, n)), n, tau, par, noise_state(rng))
+    p = columns.T
     assert p[:, PX].mean() == pytest.approx(51.15, abs=1e-3)
     assert p[:, PX].var() == pytest.approx(0.05**2 * tau, rel=0.05)
     residual = p[:, PVX] - trapezoid(p[:, PX])
@@ -260,7 +292,7 @@ def test_moments_of_the_mode_are_those_of_its_particles() -> None:
     runner = Runner(particle_bank(), 1, 20_000, seed=1)
     obj = in_mode_0(runner)
     runner.scan([0], [10], Z, R)
-    p = runner.particles[0]
+    p = runner.particles[0].T
     np.testing.assert_allclose(obj["x"][1, :4], p[:, :4].mean(axis=0), atol=0.005)
     np.testing.assert_allclose(obj["P"][1, :4, :4], np.cov(p[:, :4].T), atol=0.005)
     assert (p[:, PY] >= 0.5).all()
@@ -285,7 +317,8 @@ def test_what_a_slot_held_before_does_not_matter(left_over: float) -> None:
     logs = []
     for value in (left_over, 1e6):
         runner = Runner(particle_bank(), 1, 2000, seed=3)
-        runner.particles[:] = [value, 2.1, 0.6, 0.0, value - 2.0, 2.1, 3.75]
+        row = np.array([value, 2.1, 0.6, 0.0, value - 2.0, 2.1, 3.75])
+        runner.particles[:] = row[:, None]
         assert runner.scan([0], [-1], X0, R)[0] == imm.OK
         runner.scan([0], [10], Z, R)
         logs.append(runner.objects[0]["log_l"][1])

@@ -195,7 +195,7 @@ REFUSALS = [
     ("mode.0.soft.1.ground", "yes", "mode 'KEEP', soft 2: 'ground' must be true or false"),
     ("mode.1.bounds.0.ground", True, "mode 'CHANGE', bounds 1: 'ground' is for vx"),
     ("mode.0.soft.1", {"state": "vx", "ground": True, "lane": "left", "r": 1.0}, "'ground' is"),
-    ("mode.0.entry", [{"state": "vx", "ground": True, "mean": 0, "std": 1}], "unknown key 'ground'"),
+    ("mode.0.entry", [{"state": "vx", "ground": True, "mean": 0, "std": 1}], "key 'ground'"),
     ("mode.0.x.model", "damped", "mode 'KEEP', x: 'tau_s' is missing"),
     ("mode.0.x", {"model": "damped", "tau_s": 0.0, "speed_std": 1.0}, "'tau_s'"),
     ("mode.0.x", {"model": "damped", "tau_s": 1.0, "speed_std": -1.0}, "'speed_std'"),

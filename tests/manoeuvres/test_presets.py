@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from can_imm.estimation.layout import FIXED, GROUND, LANE
+from can_imm.estimation.road import PARAMETERS
 from can_imm.manoeuvres import Manoeuvre, ModeBank, builtin_presets, load_bank
+from can_imm.types import CanImmError
 
 STATES = ["x", "vx", "y", "vy", "ax", "ay"]
 TWO_LANES = [m for m in Manoeuvre if Manoeuvre.KEEP_RIGHT <= m <= Manoeuvre.REAR_END]
@@ -201,6 +203,33 @@ def test_motorway() -> None:
     # every mode can be reached from every other one
     m = len(bank.modes)
     assert (r["Pi"][200, :m, :m] > 0.0).all()
+
+
+def test_lanes_that_are_known() -> None:
+    """Taken as they are, and not learned."""
+    bank, usual = load_bank("motorway", lane_width=3.2, lane_offset=-0.3), load_bank("motorway")
+    assert bank.road is not None
+    assert usual.road is not None
+    told = dict(zip(PARAMETERS, bank.road, strict=True))
+    assert (told["width"], told["offset"], bank.lane_width) == (3.2, -0.3, 3.2)
+    assert max(told["width_std"], told["offset_std"]) <= 0.05
+    assert (bank.road != usual.road).sum() <= 4
+    assert load_bank("two-lane", lane_width=3.2).record[0]["lane_prior"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "lanes", "message"),
+    [
+        ("motorway", {"lane_width": 1.9}, "width must be 2 to 6 m, not 1.9"),
+        ("motorway", {"lane_width": math.nan}, "width must be"),
+        ("motorway", {"lane_offset": 3.1}, "offset must be -3 to 3 m, not 3.1"),
+        ("motorway", {"lane_offset": math.nan}, "offset must be"),
+        ("two-lane", {"lane_offset": 0.1}, r"two-lane.*: this preset has no \[road\]"),
+    ],
+)
+def test_lanes_that_are_none(name: str, lanes: dict[str, float], message: str) -> None:
+    with pytest.raises(CanImmError, match=message):
+        load_bank(name, **lanes)
 
 
 @pytest.mark.parametrize("step_ms", [5, 10, 20, 50])

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from can_imm.bus.frame import Frame
 from can_imm.runtime.clock import JUMP_NS, FastClock
-from can_imm.runtime.feeds import BusFeed, IdleFeed, LogFeed
+from can_imm.runtime.feeds import REHEARSE_S, BusFeed, IdleFeed, LogFeed
 from can_imm.runtime.health import Health
 
 STEP = 10_000_000
@@ -43,7 +43,8 @@ class FakeBus:
             at, received = self.arrivals.pop(0)
             self.time_ns = max(self.time_ns, at)
             return received
-        self.time_ns = until
+        # to look takes a moment, too
+        self.time_ns = max(until, self.time_ns + US)
         return None
 
 
@@ -76,7 +77,31 @@ class TestBusFeed:
         feed, bus, _ = live(UNIX)
         feed.start_ns(STEP)
         feed.collect(UNIX + STEP)
-        assert bus.time_ns == UNIX + STEP + 2_000_000
+        assert 0 <= bus.time_ns - (UNIX + STEP + 2_000_000) <= US
+
+    def test_a_step_with_frames_is_rehearsed_with_them_before_it_is_due(self):
+        stamp = UNIX + STEP - US
+        feed, bus, _ = live(UNIX, (stamp, frame(stamp)))
+        said = []
+        feed.rehearse = lambda t_ns, frames: said.append((t_ns, times(frames), bus.time_ns))
+        feed.start_ns(STEP)
+        assert said.pop() == (0, [], UNIX), "the first time is before the start"
+        for k in (1, 2):
+            assert len(feed.collect(UNIX + k * STEP)) == (k == 1)
+        (rehearsal,) = said
+        due = UNIX + STEP + 2_000_000
+        assert rehearsal[:2] == (UNIX + STEP, [stamp])
+        assert due - REHEARSE_S * 1e9 - US <= rehearsal[2] < due
+
+    def test_a_step_that_is_late_is_not_rehearsed(self):
+        stamp = UNIX + STEP - US
+        feed, bus, _ = live(UNIX, (stamp, frame(stamp)))
+        feed.start_ns(STEP)
+        said = []
+        feed.rehearse = lambda t_ns, frames: said.append(t_ns)
+        bus.time_ns = UNIX + STEP + 1_900_000
+        assert len(feed.collect(UNIX + STEP)) == 1
+        assert said == []
 
     def test_a_frame_that_is_late_within_the_guard_time_is_not_late(self):
         stamp = UNIX + STEP - US

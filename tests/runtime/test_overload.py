@@ -39,7 +39,7 @@ class SimulatedTime:
             frame = self._frames.pop(0)
             self.now = max(self.now, frame.t_ns)
             return frame
-        self.now = end
+        self.now = max(end, self.now + 1000)  # to look takes a moment, too
         return None
 
 
@@ -151,3 +151,18 @@ def test_more_scans_at_once_than_may_wait_are_counted(profile):
     node.step(START_NS + 100 * STEP_NS, frames)
     assert node.dropped_scans == 3
     assert GUARD_NS < STEP_NS
+
+
+def test_rehearsals_change_no_answer(profile):
+    answers = []
+    for rehearses in (False, True):
+        node, said = detector_node(profile, Health()), []
+        if rehearses:
+            node.rehearse(0, [])
+        for frame in sensor_frames(30):
+            if rehearses:
+                node.rehearse(frame.t_ns, [frame])
+            said += node.step(frame.t_ns // STEP_NS * STEP_NS + STEP_NS, [frame])
+        assert len(said) > 60
+        answers.append(said)
+    assert answers[0] == answers[1]

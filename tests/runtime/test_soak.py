@@ -108,10 +108,13 @@ def test_kernels_allocate_nothing(profile):
     scan.valid[:] = True
     scan.z[:] = 40.0, 1.0, 1.5, 1.0  # all modes have something to do
     for first_ones in (-1, 10):
-        detector._slot[:], detector._steps[:], detector._r[:] = range(8), first_ones, 0.1
-        arguments = detector._arguments(scan, 8, 0.0)
-        assert allocations(detector._process, arguments) == 0
-        assert (detector._status == 0).all()
+        detector._slot[:8], detector._steps[:8], detector._r[:8] = range(8), first_ones, 0.1
+        detector._z[:8], detector._valid[:8] = scan.z, True
+        processor = detector._processor
+        assert allocations(processor.run, (processor.address, 8, -1e3, 0.0, 0.0)) == 0
+        assert (detector._status[:8] == 0).all()
+    assert allocations(detector._assign, detector._assign_arguments(scan, 8, 0)) == 0
+    assert allocations(detector._settle, detector._settle_arguments(8, 0)) == 0
     assert allocations(detector._fill, detector._report_arguments(0)) == 0
 
 

@@ -60,11 +60,11 @@ def test_filterpy_comes_to_the_same_conclusions():
     variance = bank.measurement_variance
     estimator = bench.Estimator(bank, 1)
     theirs = peer.imm_peer(bank, bench.STEPS, [0, 1, 2, 3], variance, observation.z[0])
-    obj = estimator._head[1]
-    estimator._step(*estimator._birth)
+    obj = estimator.objects
     same, distance = [], []
-    for z in estimator._scans[1:]:
-        estimator._step(*estimator._head, z, *estimator._tail)
+    steps = estimator.steps()
+    next(steps)
+    for z in steps:
         theirs.predict()
         theirs.update(z[0])
         same.append(np.argmax(obj["mu"][0, :6]) == np.argmax(theirs.mu))

@@ -42,9 +42,15 @@ def drive_of(*tracks):
         long = {k: np.repeat(getattr(one, k), PER_FRAME) for k in ("label", "direction", "lane")}
         objects.append(
             ObjectTruth(
-                object_id=number, first=0, t_ns=np.arange(n, dtype=np.int64) * DT_NS,
-                state=np.zeros((n, 4)), flags=np.zeros(n, np.int8), speed=np.zeros(n),
-                station=np.zeros(n), d=np.zeros(n), **long,
+                object_id=number,
+                first=0,
+                t_ns=np.arange(n, dtype=np.int64) * DT_NS,
+                state=np.zeros((n, 4)),
+                flags=np.zeros(n, np.int8),
+                speed=np.zeros(n),
+                station=np.zeros(n),
+                d=np.zeros(n),
+                **long,
             )  # fmt: skip
         )
         frames.append(len(one.label))
@@ -82,9 +88,7 @@ def say(run, **changed):
     return Said(**{**values, **changed})
 
 
-CHANGING = track(
-    stretch((KEEP, 30), (CHANGE, 40), (KEEP, 30)), stretch((0, 30), (1, 40), (0, 30))
-)
+CHANGING = track(stretch((KEEP, 30), (CHANGE, 40), (KEEP, 30)), stretch((0, 30), (1, 40), (0, 30)))
 
 
 def test_all_right():

@@ -191,9 +191,7 @@ def said(x, *, speed=30.0, rules=SIMPLE):
     x = np.asarray(x, np.float64)
     n = len(x)
     begins = np.arange(n) == 0
-    return [
-        a.tolist() for a in judge(np.zeros(n, np.int32), np.full(n, speed), x, begins, rules)
-    ]
+    return [a.tolist() for a in judge(np.zeros(n, np.int32), np.full(n, speed), x, begins, rules)]
 
 
 def test_speed_thresholds_with_hysteresis():

@@ -162,9 +162,7 @@ def test_frames_without_a_report_are_wrong():
 
 def test_straight_roads_have_rules_of_their_own(monkeypatch):
     monkeypatch.setitem(PLAIN_RULES, "can_imm", START._replace(receding=100.0))
-    results = study(
-        1, 904, profiles=["can_imm"], systems=["rules"], settings=SHORT, straight=True
-    )
+    results = study(1, 904, profiles=["can_imm"], systems=["rules"], settings=SHORT, straight=True)
     confusion = results[0].scores[0].metrics.confusion
     assert confusion[:, Manoeuvre.RECEDING].sum() == 0
     run = play_motorway("can_imm", 904, plain(SHORT))
