@@ -1,4 +1,4 @@
-"""What reports of several objects, and of several scans, say together: cut-ins, overtaking, twins."""
+"""What reports of several objects and scans say together: cut-ins, overtaking, twins."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ MEMORY_DTYPE = np.dtype(
     ],
     align=True,
 )
-"""What is remembered of a slot: ``kept`` the lane it kept last, ``left`` the lane that it left to the left
-at ``left_ns`` (lanes by their number, `NO_LANE` for none); ``twin`` slot of an object that has been in
-the same place for ``twin_scans`` scans."""
+"""What is remembered of a slot: ``kept`` the lane it kept last, ``left`` the lane that it left to
+the left at ``left_ns`` (lanes by their number, `NO_LANE` for none); ``twin`` slot of an object that
+has been in the same place for ``twin_scans`` scans."""
 
 OVERTAKING_NS = 20_000_000_000
 """So long after a lane change to the left [ns] passing the other lane's vehicles is overtaking."""
 AHEAD_M, BEHIND_M, FASTER = 40.0, 10.0, 0.5
 """An object overtakes one that is up to so far ahead or behind [m] and so much slower [m/s]."""
 TWIN_M, TWIN_WIDTH_M, TWIN_SPEED = 3.0, 1.0, 1.0
-"""No two vehicles are so near to each other along and across the road [m] at the same speed [m/s]."""
+"""No two vehicles are so near along and across the road [m] at the same speed [m/s]."""
 TWIN_SCANS = 3
 
 _LANE_CHANGE = int(Manoeuvre.LANE_CHANGE)
@@ -45,8 +45,8 @@ def relate_(ids: Any, memory: Any, reports: Any, n: int) -> None:  # pragma: no 
     Args:
         ids: (capacity,) object id of each slot, -1 for a free one.
         memory: (capacity,) of `MEMORY_DTYPE`.
-        reports: (capacity,) of REPORT_DTYPE in the order of the slots in use, positions in the axes of
-            the road.  n: number of them.
+        reports: (capacity,) of REPORT_DTYPE in the order of the slots in use, positions in the axes
+            of the road.  n: number of them.
     """
     rows = np.empty(n, np.int64)
     k = 0

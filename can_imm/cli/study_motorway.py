@@ -132,6 +132,10 @@ def _motorway(args: argparse.Namespace) -> int:
         highlight=False,
     )
     for title, columns in _TABLES.items():
+        keys = {key for key, _, _ in columns.values()}
+        # on a straight road there is nothing but traffic
+        if all(result.get(key) is None for result in data["results"] for key in keys):
+            continue
         console.print(_table(title, data["results"], columns))
         console.print()
     return 0

@@ -45,7 +45,7 @@ class ModeBank:
         n_particles: of the particle mode, 0 without one.
         step_ns: step that the tables are made for [ns].
         lane_width: [m].
-        road: (19,) `estimation.road.PARAMETERS`, None for a bank whose lanes stand still in the
+        road: `estimation.road.PARAMETERS`, None for a bank whose lanes stand still in the
             sensor's axes.
         measurement_variance: (4,) to be used instead of the sensor's own, or None.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -51,7 +52,7 @@ def drive_of(*tracks):
                 station=np.zeros(n),
                 d=np.zeros(n),
                 **long,
-            )  # fmt: skip
+            )
         )
         frames.append(len(one.label))
     first = np.concatenate(([0], np.cumsum(frames)))
@@ -70,7 +71,7 @@ def drive_of(*tracks):
         direction=rows("direction"),
         lane=rows("lane"),
         state=np.zeros((int(first[-1]), 4)),
-        tracks=[np.arange(a, b) for a, b in zip(first[:-1], first[1:], strict=True)],
+        tracks=[np.arange(a, b) for a, b in pairwise(first)],
     )
 
 
