@@ -25,9 +25,9 @@ def conclude_(
     """Fill one report from mode probabilities and the combined estimate.
 
     A manoeuvre's probability is the sum over its modes; the direction of a lane change is that of
-    its likelier modes; the lane is the nearest
-    one.  Where APPROACHING turns into REAR_END by the gap, its probability is shared out by how likely
-    the object is to be that near, and in the ego's lane.
+    its likelier modes; the lane is the nearest one.  Where APPROACHING turns into REAR_END by the
+    gap, its probability is shared out by how likely the object is to be that near, and in the
+    ego's lane.
 
     Args:
         bank: record of `layout.BANK_DTYPE`.  width: of the object's lanes [m].

@@ -245,7 +245,7 @@ def print_summary(
 
 
 def _ego_motion(detection: Detection) -> list[tuple[str, str]]:
-    """What was heard of the ego's motion, for a mode bank that asks for it, and of other sensors."""
+    """What was heard of the ego's motion, if the mode bank asks for it, and of other sensors."""
     counts = detection.node.decoder.counts
     lines = []
     if detection.node.detector.bank.road is not None:

@@ -91,12 +91,12 @@ RADARS = {
             duplicates=0.003,
         ),
         RadarModel(
-            "toyota", 0.05, (0.08, 0.06, 0.08, _NAN), wander=(0.12, 0.2), wander_time=0.4, slots=16, in_turn=False,
-            hold=0.0, rest=0.0, missed=0.01, dropout=0.002, duplicates=0.003,
+            "toyota", 0.05, (0.08, 0.06, 0.08, _NAN), wander=(0.12, 0.2), wander_time=0.4,
+            slots=16, in_turn=False, hold=0.0, rest=0.0, missed=0.01, dropout=0.002, duplicates=0.003,
         ),
         RadarModel(
-            "toyota-tss2", 0.05, (0.08, 0.06, 0.08, _NAN), wander=(0.12, 0.2), wander_time=0.4, slots=16,
-            in_turn=False, hold=0.0, rest=0.0, missed=0.01, dropout=0.002, duplicates=0.003,
+            "toyota-tss2", 0.05, (0.08, 0.06, 0.08, _NAN), wander=(0.12, 0.2), wander_time=0.4,
+            slots=16, in_turn=False, hold=0.0, rest=0.0, missed=0.01, dropout=0.002, duplicates=0.003,
         ),
         RadarModel(
             "esr", 0.05, (0.2, 0.1, radians(0.4)), polar=True, slots=64, in_turn=False, rest=0.2,
