@@ -406,6 +406,7 @@ class Detector:
                 None if self._road is None else self._road.x, moved, self._ego_speed,
             )  # fmt: skip
         if self._road is not None:
+            self._road.doubt_(self.reports, n)
             relate_(self._id, self._memory, self.reports, n)
             self._road.globalise_(self.reports, n)
         return n

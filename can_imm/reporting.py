@@ -10,12 +10,35 @@ import numpy as np
 
 from can_imm.estimation.constraints import normal_mass
 from can_imm.estimation.imm import extrapolate_
-from can_imm.estimation.road import place
+from can_imm.estimation.road import lane_row_, place, variance
 from can_imm.types import FloatArray, Manoeuvre
 
 _LANE_CHANGE = int(Manoeuvre.LANE_CHANGE)
 _APPROACHING = int(Manoeuvre.APPROACHING)
 _REAR_END = int(Manoeuvre.REAR_END)
+_RECEDING = int(Manoeuvre.RECEDING)
+_KEEP_LANE = int(Manoeuvre.KEEP_LANE)
+
+STEADY = 0.6
+"""Up to this relative speed [m/s] an object is about as fast as the ego."""
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def decide_(report: Any) -> int:
+    """Set the most and the second most probable manoeuvre of a report; returns the first."""
+    best = 1
+    for i in range(2, report.p.shape[0]):
+        if report.p[i] > report.p[best]:
+            best = i
+    second = 1 if best != 1 else 2
+    for i in range(1, report.p.shape[0]):
+        if i != best and report.p[i] > report.p[second]:
+            second = i
+    report.manoeuvre = best
+    report.second = second
+    report.probability = report.p[best]
+    report.second_probability = report.p[second]
+    return best
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -48,18 +71,7 @@ def conclude_(
         )
         report.p[_REAR_END] += near * report.p[_APPROACHING]
         report.p[_APPROACHING] *= 1.0 - near
-    best = 1
-    for i in range(2, report.p.shape[0]):
-        if report.p[i] > report.p[best]:
-            best = i
-    second = 1 if best != 1 else 2
-    for i in range(1, report.p.shape[0]):
-        if i != best and report.p[i] > report.p[second]:
-            second = i
-    report.manoeuvre = best
-    report.second = second
-    report.probability = report.p[best]
-    report.second_probability = report.p[second]
+    best = decide_(report)
     report.flags = 0
     report.duplicate_of = -1
     report.ego_speed = np.nan
@@ -152,3 +164,30 @@ def globalise_(road: FloatArray, h: FloatArray, reports: Any, n: int, speed: flo
         report.x[2] += y
         report.x[3] += vy
         report.ego_speed = speed
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def doubt_(P: FloatArray, doubtful: float, h: FloatArray, reports: Any, n: int) -> None:
+    """Trust lane changes of the first n reports no further than the road is known, in place.
+
+    Where the road ahead is known to s metres, what looks like a lane change is one with a share of
+    1 / (1 + (s / doubtful)^4); the rest goes to what its speed makes of the object.
+
+    Args:
+        P: (31, 31) covariance of `estimation.road`.  h: (8,) scratch.
+        doubtful: [m].
+    """
+    for k in range(n):
+        report = reports[k]
+        p = report.p[_LANE_CHANGE]
+        if p < 0.01:
+            continue
+        lane_row_(h, report.x[0])
+        share = 1.0 / (1.0 + (variance(P, h) / doubtful**2) ** 2)
+        other = _KEEP_LANE
+        if abs(report.x[1]) > STEADY:
+            other = _RECEDING if report.x[1] > 0.0 else _APPROACHING
+        report.p[_LANE_CHANGE] = share * p
+        report.p[other] += (1.0 - share) * p
+        if decide_(report) != _LANE_CHANGE:
+            report.direction = 0

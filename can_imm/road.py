@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from can_imm.estimation import road
-from can_imm.reporting import globalise_
+from can_imm.reporting import doubt_, globalise_
 from can_imm.types import FloatArray, Scan
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ class RoadFrame:
         self._par = par
         self._guide_slot = np.full(road.N_GUIDES, road.FREE, np.int32)
         self._guide_unseen = np.zeros(road.N_GUIDES)
+        self._unrest = np.ones(1)
         self.x, self.P = road.new_road(par)
         self._t_ns = -1
         self._dt = 0.1
@@ -88,11 +89,20 @@ class RoadFrame:
             r = np.square(scan.std)
         return int(
             road.watch_traffic_(
-                self.x, self.P, self._par, self._guide_slot, self._guide_unseen,
+                self.x, self.P, self._par, self._guide_slot, self._guide_unseen, self._unrest,
                 bank.record, objects, scan.n, slot, status, age,
                 scan.z, r, scan.valid, scan.angle, self._dt,
             )
         )  # fmt: skip
+
+    def doubt_(self, reports: np.ndarray[Any, np.dtype[np.void]], n: int) -> None:
+        """Trust lane changes no further than the road is known; see `reporting.doubt_`.
+
+        Without the ego's motion nothing is known of the road, and it is taken to be straight.
+        """
+        if math.isnan(self._speed):
+            return
+        doubt_(self.P, self._par[road.P_DOUBTFUL], self._h, reports, n)
 
     def globalise_(self, reports: np.ndarray[Any, np.dtype[np.void]], n: int) -> None:
         """The first n reports from the road's axes into the sensor's, in place."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import gzip
 import io
 import sys
 import tempfile
@@ -29,18 +30,38 @@ EPOCH_S = 1_700_000_000
 DECIMALS = 2
 """Of every number in the expected answers: another machine's last digits do not show."""
 
-AS_WRITTEN = ("time_s", "object_id", "manoeuvre", "lane", "direction")
+AS_WRITTEN = ("time_s", "object_id", "manoeuvre", "lane", "direction", "flags", "duplicate_of")
 """Columns of the answers that are not rounded."""
 
 TRUTH_COLUMNS = ("time_s", "object_id", "manoeuvre", "direction")
+PLACE_COLUMNS = ("x", "y")
 
 
 class Case(NamedTuple):
-    """One log: its name in replay/, the options of ``simulate``, and what befalls it."""
+    """One log.
+
+    Attributes:
+        name: in replay/.
+        options: of ``simulate``.
+        damage: what befalls the log.
+        replay: options of ``replay``.
+        until_s: the log is cut off after this time [s].
+        every: the answers to the other scans are left out.  The log is packed then.  The truth is
+            that at the scans which are left, with the objects' places, since its ids are not those
+            of the sensor.
+    """
 
     name: str
     options: tuple[str, ...]
     damage: Callable[[str], str] | None = None
+    replay: tuple[str, ...] = ()
+    until_s: int = 3600
+    every: int = 1
+
+    @property
+    def log(self) -> str:
+        """Name of the log file."""
+        return f"{self.name}.log.gz" if self.every > 1 else f"{self.name}.log"
 
 
 def damaged(log: str) -> str:
@@ -66,25 +87,47 @@ CASES = [
         "random-1006",
         ("--scenario", "random", "--seed", "1006", "--missed", "0.02", "--dropout", "0.01"),
     ),
+    Case(
+        "motorway-ars408",
+        ("--scenario", "motorway", "--seed", "1010", "--profile", "ars408"),
+        replay=("--profile", "ars408", "--preset", "motorway"),
+        until_s=12,
+        every=7,
+    ),
     Case("damaged", ("--scenario", str(REPLAY / "two-cars.toml"), "--seed", "1008"), damaged),
 ]
 
 
 def record(case: Case, directory: Path) -> None:
     """Write NAME.log, NAME.truth.csv and NAME.csv, the expected answers, into ``directory``."""
-    log = directory / f"{case.name}.log"
+    log = directory / case.log
     with tempfile.TemporaryDirectory() as scratch:
-        played, truth = Path(scratch, "played.log"), Path(scratch, "truth.csv")
+        played, moved = Path(scratch, "played.log"), Path(scratch, "moved.log")
+        truth = Path(scratch, "truth.csv")
         run("simulate", *case.options, "--log", played, "--truth", truth)
-        with LogSource(played) as source, LogSink(log) as sink:
+        with LogSource(played) as source, LogSink(moved) as sink:
             for frame in source:
-                sink.send(frame._replace(t_ns=frame.t_ns + EPOCH_S * 1_000_000_000))
-        if case.damage is not None:
-            log.write_text(case.damage(log.read_text()))
-        changes = label_changes(read_rows(truth))
-        write_rows(directory / f"{case.name}.truth.csv", TRUTH_COLUMNS, changes)
-    rows, _ = answers(log)
+                if frame.t_ns <= case.until_s * 1_000_000_000:
+                    sink.send(frame._replace(t_ns=frame.t_ns + EPOCH_S * 1_000_000_000))
+        log.write_bytes(finished(case, moved.read_text()))
+        happened = read_rows(truth)
+    rows, _ = answers(case, log)
     write_rows(directory / f"{case.name}.csv", rows[0].keys(), map(rounded, rows))
+    for row in happened:
+        row["time_s"] = f"{Decimal(row['time_s']) + EPOCH_S:.6f}"
+    if case.every == 1:
+        columns, happened = TRUTH_COLUMNS, label_changes(happened)
+    else:
+        columns, times = (*TRUTH_COLUMNS, *PLACE_COLUMNS), {row["time_s"] for row in rows}
+        kept = [row for row in happened if row["time_s"] in times]
+        happened = [rounded({name: row[name] for name in columns}) for row in kept]
+    write_rows(directory / f"{case.name}.truth.csv", columns, happened)
+
+
+def finished(case: Case, log: str) -> bytes:
+    """Content of a log file; a packed one does not say when or where it was packed."""
+    data = (log if case.damage is None else case.damage(log)).encode()
+    return gzip.compress(data, mtime=0) if case.log.endswith(".gz") else data
 
 
 def run(*arguments: object) -> str:
@@ -96,16 +139,18 @@ def run(*arguments: object) -> str:
     return said.getvalue()
 
 
-def answers(log: Path) -> tuple[list[dict[str, str]], str]:
-    """Replay a log; return the rows of ``--csv`` and the summary."""
+def answers(case: Case, log: Path) -> tuple[list[dict[str, str]], str]:
+    """Replay a case's log; return the rows of ``--csv`` that count, and the summary."""
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch, "answers.csv")
-        summary = run("replay", log, "--csv", path)
-        return read_rows(path), summary
+        summary = run("replay", log, *case.replay, "--csv", path)
+        rows = read_rows(path)
+    times = {time_s: k for k, time_s in enumerate(dict.fromkeys(row["time_s"] for row in rows))}
+    return [row for row in rows if times[row["time_s"]] % case.every == 0], summary
 
 
 def rounded(row: dict[str, str]) -> dict[str, str]:
-    """A row of answers to `DECIMALS`; adding 0 makes a zero of -0, whose sign is noise."""
+    """A row to `DECIMALS`; adding 0 makes a zero of -0, whose sign is noise."""
     return {
         name: text if name in AS_WRITTEN else f"{round(float(text), DECIMALS) + 0.0:.{DECIMALS}f}"
         for name, text in row.items()
@@ -113,14 +158,13 @@ def rounded(row: dict[str, str]) -> dict[str, str]:
 
 
 def label_changes(truth: Iterable[dict[str, str]]) -> list[dict[str, str]]:
-    """Rows of ``simulate --truth`` in which an object begins something else, in bus time."""
+    """Rows of ``simulate --truth`` in which an object begins something else."""
     before: dict[str, str] = {}
     changes = []
     for row in truth:
         if before.get(row["object_id"]) != row["manoeuvre"]:
             before[row["object_id"]] = row["manoeuvre"]
-            time_s = f"{Decimal(row['time_s']) + EPOCH_S:.6f}"
-            changes.append({**{name: row[name] for name in TRUTH_COLUMNS}, "time_s": time_s})
+            changes.append({name: row[name] for name in TRUTH_COLUMNS})
     return changes
 
 

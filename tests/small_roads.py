@@ -21,6 +21,7 @@ USUAL = {
     "yaw_noise_unknown": 0.01,
     "drift": 0.05, "wander_std": 0.2, "wander_time": 4.0, "freedom": 0.1, "freedom_changing": 1.0,
     "error_weight": 3.0, "error_most": 0.5, "speed_error_weight": 10.0, "speed_error_most": 2.0,
+    "doubtful": 0.5, "unrest_change": 1e-9, "unrest_curvature": 1e-9,
 }  # fmt: skip
 
 
@@ -83,7 +84,7 @@ class Traffic:
             self.age[s] += 1
         return int(
             road.watch_traffic_(
-                self.x, self.P, self.par, self.guide_slot, self.guide_unseen,
+                self.x, self.P, self.par, self.guide_slot, self.guide_unseen, np.ones(1),
                 self.bank, self.objects, n, np.array(slots, np.int32),
                 np.full(n, status, np.int8), self.age, z, np.full((n, 4), std**2),
                 np.ones((n, 4), np.bool_), np.full(n, angle), dt,

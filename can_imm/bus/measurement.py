@@ -8,7 +8,7 @@ import numpy as np
 
 from can_imm.bus.layout import CLASS, COLUMNS, EXISTENCE, LENGTH, WIDTH, Layout, total_std
 from can_imm.bus.profile_parts import Profile
-from can_imm.types import Scan
+from can_imm.types import Scan, Y
 
 _NEAREST = 1.0
 """A polar sensor's error across is not less than it is at this range [m]."""
@@ -32,6 +32,8 @@ class ObjectList:
                 self._defaults[state] = total_std(part, part.std, signal)
             else:
                 self._defaults[state] = 1.0
+        across = profile.state[Y]
+        self._per_m = across.std_per_m * across.factor if across else 0.0
         self._stds = any(column < 4 for column in self._columns)
         self._also = layout.also + 1
         self._fields: list[list[int]] = [[] for _ in range(self._also)]
@@ -114,6 +116,9 @@ class ObjectList:
             scan.existence[:n] = table[:, EXISTENCE]
             scan.object_class[:n] = table[:, CLASS]
             scan.size[:n] = table[:, [LENGTH, WIDTH]]
+        if self._per_m:
+            std = scan.std[:n, 2] if self._stds else self._defaults[2]
+            np.hypot(std, self._per_m * z[:, 0], out=scan.std[:n, 2])
         if self._polar:
             self._to_cartesian_axes(scan, n)
 

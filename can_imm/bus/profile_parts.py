@@ -32,7 +32,8 @@ class Component:
 
     ``std``, ``std_floor`` and ``offset`` are in the signal's unit, ``unit``; ``factor`` takes it to
     SI units.  ``std_from`` is the signal with which the sensor sends its own standard deviation,
-    not believed below ``std_floor``.
+    not believed below ``std_floor``.  ``std_per_m``, in the unit per metre of distance ahead, is
+    added in quadrature: an error of the bearing.
     """
 
     signal: str
@@ -43,6 +44,7 @@ class Component:
     factor: float
     std_from: Code | None
     std_floor: float
+    std_per_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,8 @@ class Mounting:
 class EgoSignal:
     """Speed or yaw rate of the observing vehicle: ``(sign * value + offset) * factor`` if all of
     ``valid_if`` hold, with the other sign if ``reverse_if`` holds.  The value is the mean of the
-    signals ``mean_of``, all of one scale; often there is only one."""
+    signals ``mean_of``, all of one scale; often there is only one.  An encoder makes
+    ``forwards_if`` hold if the value is positive, and ``standstill_if`` if it is about 0."""
 
     message: Any
     mean_of: tuple[str, ...]
@@ -113,11 +116,14 @@ class EgoSignal:
     protection: str
     valid_if: tuple[Condition, ...]
     reverse_if: Condition | None
+    forwards_if: Condition | None = None
+    standstill_if: Condition | None = None
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """All signals that are read."""
-        conditions = (*self.valid_if, *([self.reverse_if] if self.reverse_if else []))
+        """All signals; a reader needs those up to that of ``reverse_if``."""
+        directions = (self.reverse_if, self.forwards_if, self.standstill_if)
+        conditions = (*self.valid_if, *(each for each in directions if each))
         return (*self.mean_of, *(condition.signal for condition in conditions))
 
 

@@ -169,10 +169,13 @@ def read_component(table: Table, what: str, find: Callable[[str], Any], named: C
         to_si(unit),
         std_from,
         table.number("std_floor", 0.0, low=0.0, high=_LARGEST),
+        table.number("std_per_m", 0.0, low=0.0, high=_LARGEST),
     )
     table.done()
     if component.std_floor and std_from is None:
         raise table.error("'std_floor' is of use only with a 'std_signal'")
+    if component.std_per_m and what != "y":
+        raise table.error("'std_per_m' is for y: an error of the bearing")
     return component
 
 
@@ -236,7 +239,10 @@ def _ego_signal(table: Table, what: str, database: Database) -> EgoSignal:
         to_si(unit),
         read_kind(table, "protection", "none"),
         tuple(read_condition(inner) for inner in table.tables("valid_if", [])),
-        read_condition(table.table("reverse_if")) if "reverse_if" in table else None,
+        *(
+            read_condition(table.table(name)) if name in table else None
+            for name in ("reverse_if", "forwards_if", "standstill_if")
+        ),
     )
     table.done()
     return part

@@ -14,6 +14,9 @@ from can_imm.bus.packing import InverseTable, MessagePacker
 from can_imm.bus.profile_parts import Condition, EgoSignal, Profile
 from can_imm.types import FloatArray, Scan
 
+STANDSTILL = 0.05
+"""A vehicle slower than this [m/s] is said to stand, where a profile has a condition for that."""
+
 
 class ProfileEncoder:
     """The frames of a profile's sensor.
@@ -241,9 +244,13 @@ def _ego_raws(part: EgoSignal, value: float) -> dict[str, int] | None:
     """Raw values by signal, None if there is no way to say that the value is not known."""
     fields = {name: field(part.message.get_signal_by_name(name)) for name in part.signals}
     raws = {c.signal: _fulfil(c, part.message) for c in part.valid_if}
-    if part.reverse_if is not None and value < 0:
-        value = -value
-        raws[part.reverse_if.signal] = _fulfil(part.reverse_if, part.message)
+    direction = part.forwards_if
+    if part.standstill_if is not None and abs(value) < STANDSTILL:
+        direction, value = part.standstill_if, abs(value)
+    elif part.reverse_if is not None and value < 0:
+        direction, value = part.reverse_if, -value
+    if direction is not None:
+        raws[direction.signal] = _fulfil(direction, part.message)
     wanted = (value / part.factor - part.offset) * part.sign
     for name in part.mean_of:
         raws[name] = fields[name].raw(wanted)

@@ -23,6 +23,10 @@ COLOURS = {
     Manoeuvre.RECEDING: "#d99ac0",
     Manoeuvre.APPROACHING: "#e8dc50",
     Manoeuvre.REAR_END: "#f0703c",
+    # never true on the road of two lanes, but a motorway's preset may say so
+    Manoeuvre.KEEP_LANE: "#8fb2d8",
+    Manoeuvre.STATIONARY: "#cfc7bb",
+    Manoeuvre.ONCOMING: "#b48fd0",
 }
 """The hues of the figures, light enough for black text."""
 
@@ -34,6 +38,9 @@ SHORT = {
     Manoeuvre.RECEDING: "RE",
     Manoeuvre.APPROACHING: "AP",
     Manoeuvre.REAR_END: "REAR",
+    Manoeuvre.KEEP_LANE: "KEEP",
+    Manoeuvre.STATIONARY: "ST",
+    Manoeuvre.ONCOMING: "ON",
 }
 RIGHT, WRONG = "bold green", "bold red"
 _NAME = 6

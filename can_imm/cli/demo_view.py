@@ -29,6 +29,9 @@ FRAMES_PER_S = 12
 GONE_NS = 300_000_000
 """An object of which nothing was heard for so long [ns] is no longer on the road."""
 
+TWO_LANES = tuple(Manoeuvre(m) for m in range(Manoeuvre.KEEP_RIGHT, Manoeuvre.REAR_END + 1))
+"""Those of the scenarios' road."""
+
 STATES = (("x", "m"), ("vx", "m/s"), ("y", "m"), ("vy", "m/s"))
 SIDE = {-1: " right", 0: "", 1: " left"}
 _EIGHTHS = " ▏▎▍▌▋▊▉"
@@ -190,7 +193,7 @@ def _bars(track: Track, k: int, width: int) -> list[Text]:
     """Seven lines: probability of each manoeuvre; a mark at the true one."""
     lines = []
     size = width - 21
-    for manoeuvre in list(Manoeuvre)[1:]:
+    for manoeuvre in TWO_LANES:
         p = float(track.p[k, manoeuvre]) if k >= 0 else 0.0
         is_true = k >= 0 and track.label[k] == manoeuvre
         is_said = k >= 0 and track.manoeuvre[k] == manoeuvre

@@ -3,6 +3,7 @@
   can-imm detect -i udp_multicast                      with 'can-imm simulate' in another terminal
   can-imm detect -i socketcan -c can0 --log drive.blf  and record everything
   can-imm detect -i socketcan -c can0 --profile toyota --csv drive.csv
+  can-imm detect -i socketcan -c can0 --lag 0.5        better answers, half a second later
 
 A line on standard error says when it listens; another tells of trouble on the bus (link down,
 frames lost by the kernel).  Bus settings that are not given come from python-can's configuration
@@ -20,7 +21,13 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from can_imm.cli.bus_options import add_bus_arguments, bus_name, open_bus_from
-from can_imm.cli.detection import Equipment, add_detector_arguments, print_summary, summary_console
+from can_imm.cli.detection import (
+    Equipment,
+    add_detector_arguments,
+    check_detector_arguments,
+    print_summary,
+    summary_console,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
     from can_imm.runtime.loop import run as run_loops
     from can_imm.types import CanImmError
 
+    check_detector_arguments(args)
     with ExitStack() as stack:
         bus = stack.enter_context(open_bus_from(args))
         source, sink = BusSource(bus), BusSink(bus)

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
     from can_imm.bus.decoder import DecodeCounts
     from can_imm.bus.encoder import ManoeuvreEncoder
-    from can_imm.detector import Detector
     from can_imm.events import Event, EventCollector
     from can_imm.plots.history import History
     from can_imm.runtime.health import Health
@@ -77,8 +76,16 @@ def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
         "--lag",
         type=float,
         metavar="S",
-        help="CSV and events say what is known S seconds later; the frames stay as they are",
+        help="answer S seconds later (0.01 or more), with what is known by then, which is better: "
+        "frames, CSV and events",
     )
+    parser.set_defaults(refuse=parser.error)
+
+
+def check_detector_arguments(args: argparse.Namespace) -> None:
+    """Refuse options that contradict each other, before anything is opened."""
+    if args.lag is not None and args.estimates == "step":
+        args.refuse("--estimates step looks ahead, --lag back: not both")
 
 
 def positive_int(text: str) -> int:
@@ -107,6 +114,7 @@ class Detection:
 
     def finish(self) -> None:
         """No more scans will come: conclude what waits for its end."""
+        self.node.remaining(0)  # where a bus is gone the listeners still want to know
         if self.smoothed is not None:
             self.smoothed.finish()
         self.events.finish()
@@ -159,45 +167,40 @@ class Equipment:
             from can_imm.events import EventCollector
             from can_imm.runtime.health import Health
             from can_imm.runtime.nodes import DetectorNode
+            from can_imm.runtime.smoothed import Smoothed
+            from can_imm.smoothing import FixedIntervalSmoother, FixedLagSmoother
 
             health, events, encoder = Health(), EventCollector(), ManoeuvreEncoder()
             objects = self._args.objects
             detector = Detector(self.bank, capacity=objects)
-            listeners: list[Listener] = []
-            final: list[Listener] = [events]  # hear what is said in the end
+            watchers: list[Listener] = []
+            listeners: list[Listener] = [events]  # hear what is said in the end
             if self.csv is not None:
                 self.csv.log = name
-                final.append(self.csv)
+                listeners.append(self.csv)
             if history is not None:
                 history.road = detector.road
-                listeners.append(history.watch)
-                final.append(history)
-            smoothed = self._smoothed(detector, final)
+                watchers.append(history.watch)
+                listeners.append(history)
+            smoothed = lagging = None
+            if getattr(self._args, "smooth", False):
+                detector.history = interval = FixedIntervalSmoother(self.bank)
+                smoothed = Smoothed(interval, listeners)
+                listeners = [smoothed]
+            elif self._args.lag is not None:
+                detector.history = lagging = FixedLagSmoother(self.bank, self._args.lag)
             node = DetectorNode(
                 ScanDecoder(self.profile, objects),
                 detector,
                 encoder,
                 health,
-                [*listeners, smoothed] if smoothed else listeners + final,
+                listeners,
                 objects,
                 every_step=self._args.estimates == "step",
+                smoother=lagging,
+                watchers=watchers,
             )
         return Detection(node, encoder, health, events, smoothed)
-
-    def _smoothed(self, detector: Detector, listeners: list[Listener]) -> Smoothed | None:
-        """The smoother that the options ask for, between the detector and the listeners."""
-        from can_imm.runtime.smoothed import Smoothed
-        from can_imm.smoothing import FixedIntervalSmoother, FixedLagSmoother
-
-        smoother: FixedIntervalSmoother | FixedLagSmoother
-        if getattr(self._args, "smooth", False):
-            smoother = FixedIntervalSmoother(self.bank)
-        elif self._args.lag is not None:
-            smoother = FixedLagSmoother(self.bank, self._args.lag)
-        else:
-            return None
-        detector.history = smoother
-        return Smoothed(smoother, listeners)
 
     def keep_events(self, name: str, detection: Detection) -> None:
         """Write the events of the recording ``name``, now that it has ended."""
@@ -256,6 +259,8 @@ def _ego_motion(detection: Detection) -> list[tuple[str, str]]:
                 "not on this bus: nothing is said to stand still or to be oncoming, and when the "
                 "ego changes lane or turns the others seem to",
             )
+        elif invalid := detection.node.detector.counts.ego_invalid:
+            lines[0] = ("ego motion", f"{counts.ego:,} frames; impossible in {invalid:,} scans")
     if counts.other_sensor:
         lines.append(("others", f"{counts.other_sensor:,} frames of other sensors of the kind"))
     return lines

@@ -22,7 +22,13 @@ from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from can_imm.cli.detection import Equipment, add_detector_arguments, print_summary, summary_console
+from can_imm.cli.detection import (
+    Equipment,
+    add_detector_arguments,
+    check_detector_arguments,
+    print_summary,
+    summary_console,
+)
 
 if TYPE_CHECKING:
     from can_imm.bus.sources import LogSource
@@ -58,7 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--realtime", action="store_true", help="at the speed at which it was recorded"
     )
-    parser.set_defaults(refuse=parser.error)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -92,6 +97,7 @@ def _check(args: argparse.Namespace) -> None:
     """Refuse what cannot work before anything is read or written."""
     from can_imm.types import CanImmError
 
+    check_detector_arguments(args)
     several = len(args.logs) > 1
     if args.smooth and args.lag is not None:
         args.refuse("--smooth knows the whole recording, --lag a part of it: not both")
@@ -135,6 +141,7 @@ def _replay(args: argparse.Namespace, name: str, source: LogSource, equipment: E
         loop = Loop(feed, detection.node, detection.health, recorders=[out] if out else [])
         began = time.monotonic()
         _run(loop, source)
+        loop.send_last(detection.node.remaining)
         took_s = time.monotonic() - began
     detection.finish()
     equipment.keep_events(name, detection)

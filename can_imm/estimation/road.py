@@ -64,6 +64,9 @@ PARAMETERS = (
     "error_most",
     "speed_error_weight",
     "speed_error_most",
+    "doubtful",
+    "unrest_change",
+    "unrest_curvature",
 )
 """Names of the parameters, in their order in the array.
 
@@ -76,14 +79,15 @@ stay the same; ``yaw_noise`` [rad/√s] of the heading from the yaw rate, and wi
 differently the road may bend beyond `FAR`; ``*_weight``: by how much more the variances of this
 estimate count than those of white noise, since its errors last;
 ``*_most`` [m, m/s]: no larger error is added to the measurements' noise: however little is known of
-where the lanes are far ahead, that a vehicle moves across them is seen.
+where the lanes are far ahead, that a vehicle moves across them is seen; ``doubtful`` [m]: see
+`reporting.doubt_`; ``unrest_*`` [1/m²/√s, 1/m/√s]: see `follow_bend_`.
 """
 (
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,
     P_TURN_STD, P_TURN_TIME, P_CURVATURE_STD, P_CURVATURE_LENGTH, P_CHANGE_STD, P_CHANGE_LENGTH,
     P_FAR_CURVATURE, P_BIAS_STD, P_MOUNTING_STD, P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT,
     P_WANDER_STD, P_WANDER_TIME, P_FREEDOM, P_FREEDOM_CHANGING, P_ERROR_WEIGHT, P_ERROR_MOST,
-    P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST,
+    P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST, P_DOUBTFUL, P_UNREST_CHANGE, P_UNREST_CURVATURE,
 ) = range(len(PARAMETERS))  # fmt: skip
 
 USUAL_SPEED = 25.0
@@ -94,6 +98,15 @@ FAR = 100.0
 
 SEEN_TO = 150.0
 """Vehicles further away [m] do not guide."""
+
+BIAS_TIME = 120.0
+"""How long the error of the yaw rate sensor stays the same [s]."""
+
+LANE_KNOWN = 0.2
+"""Share of the lane's width: a guide whose place is less sure does not tell where the lanes are."""
+
+UNREST_TIME = 1.0
+"""[s], see `follow_bend_`."""
 
 GATE = 16.0
 """Squared normalised innovation above which a guide is not where it was."""
@@ -171,6 +184,7 @@ def predict_road_(
     F[CURVATURE, CURVATURE] = math.exp(-abs(v) * dt / par[P_CURVATURE_LENGTH])
     F[CURVATURE, CHANGE] = v * dt
     F[CHANGE, CHANGE] = math.exp(-abs(v) * dt / par[P_CHANGE_LENGTH])
+    F[BIAS, BIAS] = math.exp(-dt / BIAS_TIME)
     F[OFFSET, HEADING] = v * dt
     turned = 0.0
     if known:
@@ -195,8 +209,7 @@ def predict_road_(
         par[P_CURVATURE_STD] ** 2 * (1.0 - F[CURVATURE, CURVATURE] ** 2) * 0.1
     )
     P[CHANGE, CHANGE] += par[P_CHANGE_STD] ** 2 * (1.0 - F[CHANGE, CHANGE] ** 2)
-    # The error of the sensor wanders by its own size in ten minutes.
-    P[BIAS, BIAS] += par[P_BIAS_STD] ** 2 * dt / 600.0
+    P[BIAS, BIAS] += par[P_BIAS_STD] ** 2 * (1.0 - F[BIAS, BIAS] ** 2)
     # A driver keeps to the lane and along it, for a while at a time; what the ego turns is mostly
     # the road's bend.
     h = np.zeros(N_ROAD + 1)
@@ -379,12 +392,66 @@ def add_width_(P: FloatArray, a: int, times: float) -> None:  # pragma: no cover
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def follow_bend_(
+    road: FloatArray,
+    P: FloatArray,
+    par: FloatArray,
+    guide_of: Any,
+    unrest: FloatArray,
+    n: int,
+    slot: Any,
+    status: Any,
+    age: Any,
+    z: FloatArray,
+    r: FloatArray,
+    valid: Any,
+    angle: FloatArray,
+    dt: float,
+) -> None:  # pragma: no cover - compiled
+    """Let the road bend faster while the guides are off to the same side, in place.
+
+    A road bends rarely, and then more than a stiff filter expects.  ``unrest`` (1,) is the squared
+    sum of the guides' normalised innovations over their number, a mean over `UNREST_TIME`; it is
+    about 1 while the road is known.  Other arguments as for `watch_traffic_`.
+    """
+    h = np.zeros(N_ROAD + 1)
+    total = 0.0
+    count = 0
+    for k in range(n):
+        s = slot[k]
+        if s < 0 or status[k] != 0 or age[s] <= 3 or not (valid[k, 0] and valid[k, 2]):
+            continue
+        g = guide_of[s]
+        if g == FREE:
+            continue
+        cos, sin = math.cos(angle[k]), math.sin(angle[k])
+        x = z[k, 0] * cos - z[k, 2] * sin
+        y = z[k, 0] * sin + z[k, 2] * cos
+        a = N_ROAD + g
+        lane_row_(h, x)
+        v = variance(P, h) + P[a, a] + r[k, 2] * cos * cos + r[k, 0] * sin * sin
+        for i in range(N_ROAD):
+            v += 2.0 * h[i] * P[i, a]
+        if v > 0.0:
+            total += min(max((y - value(road, h) - road[a]) / math.sqrt(v), -3.0), 3.0)
+            count += 1
+    if count < 2:
+        return
+    gain = min(dt / UNREST_TIME, 1.0)
+    unrest[0] += gain * (total * total / count - unrest[0])
+    extra = min(max(unrest[0] - 1.5, 0.0), 10.0) * dt
+    P[CHANGE, CHANGE] += extra * par[P_UNREST_CHANGE] ** 2
+    P[CURVATURE, CURVATURE] += extra * par[P_UNREST_CURVATURE] ** 2
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def watch_traffic_(
     road: FloatArray,
     P: FloatArray,
     par: FloatArray,
     guide_slot: IntArray,
     guide_unseen: FloatArray,
+    unrest: FloatArray,
     bank: Any,
     objects: Any,
     n: int,
@@ -403,6 +470,7 @@ def watch_traffic_(
         road, P, par: as for `localise_`.
         guide_slot: (24,) slot of each guide, `FREE` for none.
         guide_unseen: (24,) for how long it was not measured [s].
+        unrest: (1,) see `follow_bend_`; written.
         bank, objects: records of the mode bank and of the slots, after this scan's cycle.
         n: rows of the scan.  slot, status: (N,) as for `imm.process_scan_`.
         age: (capacity,) scans in which the slot's object was seen.
@@ -425,6 +493,7 @@ def watch_traffic_(
             free_guide_(P, road, g)
         else:
             guide_of[guide_slot[g]] = g
+    follow_bend_(road, P, par, guide_of, unrest, n, slot, status, age, z, r, valid, angle, dt)
     for k in range(n):
         s = slot[k]
         if s < 0 or status[k] != 0 or not (valid[k, 0] and valid[k, 2]):
@@ -471,7 +540,8 @@ def watch_traffic_(
         # In the long run vehicles drive where the lanes are; but not those between them.
         lane = math.floor(road[a] / road[WIDTH] + 0.5)
         between = 2.0 * (road[a] / road[WIDTH] - lane)
-        if moving > 0.5 or abs(lane) > 6.0 or abs(between) > 0.8:
+        known_lane = P[a, a] < (LANE_KNOWN * road[WIDTH]) ** 2
+        if moving > 0.5 or abs(lane) > 6.0 or abs(between) > 0.8 or not known_lane:
             continue
         for i in range(N_ROAD):
             h[i] = 0.0

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from can_imm.estimation.road import CHANGE, CURVATURE, HEADING, MOUNTING, N_ROAD, OFFSET, WIDTH
+from can_imm.estimation.road import (
+    CHANGE,
+    CURVATURE,
+    FAR,
+    HEADING,
+    MOUNTING,
+    N_ROAD,
+    OFFSET,
+    WIDTH,
+)
 from can_imm.types import FloatArray
 
 if TYPE_CHECKING:
@@ -106,9 +115,12 @@ def lane_middle(roads: FloatArray, x: FloatArray) -> FloatArray:
     Args:
         roads: (N, 7) states of `can_imm.estimation.road`.
     """
+    # as `lane_row_`: straight behind, and from FAR on the curvature changes no more
+    ahead = np.maximum(x, 0.0)
+    far = np.minimum(ahead, FAR)
     return np.asarray(
         -roads[:, OFFSET]
         - (roads[:, HEADING] + roads[:, MOUNTING]) * x
-        + roads[:, CURVATURE] * x**2 / 2
-        + roads[:, CHANGE] * x**3 / 6
+        + roads[:, CURVATURE] * ahead**2 / 2
+        + roads[:, CHANGE] * far * (far**2 / 6 + (ahead - far) * ahead / 2)
     )

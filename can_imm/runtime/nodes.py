@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
@@ -38,6 +38,16 @@ Reports = npt.NDArray[Any]
 Listener = Callable[[int, Reports], None]
 """Called after each scan with the step's time [ns] and the detector's reports.  The array is the
 detector's own buffer and holds good until the next step."""
+
+
+class Smoother(Protocol):
+    """What goes back over the detector's tracks, see `can_imm.smoothing`."""
+
+    def due(self, t_ns: int) -> Iterable[tuple[int, Reports]]:
+        """Give out the scans of which all is known at the step of ``t_ns``: time and reports."""
+
+    def finish(self) -> Iterable[tuple[int, Reports]]:
+        """Give out what is left."""
 
 
 class Waiting(Generic[S]):
@@ -106,6 +116,9 @@ class DetectorNode:
         listeners: called with the reports after each scan.
         capacity: objects that a scan of the decoder can hold.
         every_step: send the predicted ObjectEstimate at the steps between the scans, too.
+        smoother: the detector's history.  Sent, and told to the listeners, are its reports instead
+            of the detector's, in the step in which they are due.
+        watchers: called with the detector's own reports after each scan, smoother or not.
     """
 
     def __init__(
@@ -118,8 +131,12 @@ class DetectorNode:
         capacity: int = 64,
         *,
         every_step: bool = False,
+        smoother: Smoother | None = None,
+        watchers: Sequence[Listener] = (),
     ) -> None:
         self._every_step = every_step
+        self._smoother = smoother
+        self._watchers = watchers
         self.decoder = decoder
         self.detector = detector
         self._encoder = encoder
@@ -151,9 +168,13 @@ class DetectorNode:
             self._waiting.done(scan)
             self._seen_ns = t_ns
             reports = self.detector.reports[:n]
-            answers += self._encoder.encode(reports, t_ns, self._channel)
-            for listener in self._listeners:
-                listener(t_ns, reports)
+            for watcher in self._watchers:
+                watcher(t_ns, reports)
+            if self._smoother is None:
+                answers += self._say(t_ns, t_ns, reports)
+        if self._smoother is not None:
+            for scan_t_ns, reports in self._smoother.due(t_ns):
+                answers += self._say(t_ns, scan_t_ns, reports)
         if self._every_step and n == 0:
             predicted = self.detector.predicted[: self.detector.predict(t_ns)]
             answers += self._encoder.estimates(predicted, t_ns, self._channel)
@@ -175,10 +196,27 @@ class DetectorNode:
             )
         self._understudy.step(t_ns, frames[:REHEARSED])
 
+    def _say(self, t_ns: int, scan_t_ns: int, reports: Reports) -> list[Frame]:
+        """Return the frames of a scan, stamped ``t_ns`` [ns], and tell the listeners of it."""
+        frames = self._encoder.encode(reports, t_ns, self._channel)
+        for listener in self._listeners:
+            listener(scan_t_ns, reports)
+        return frames
+
+    def remaining(self, t_ns: int) -> list[Frame]:
+        """Return what a smoother still has to say when no more scans will come; once."""
+        answers: list[Frame] = []
+        if self._smoother is not None:
+            for scan_t_ns, reports in self._smoother.finish():
+                answers += self._say(t_ns, scan_t_ns, reports)
+        return answers
+
     def farewell(self, t_ns: int) -> list[Frame]:
-        """Return the last frame of a detector that ends: DetectorStatus, state Stopping."""
+        """Return the last frames of a detector that ends: what remains to be said, and
+        DetectorStatus, state Stopping."""
+        answers = self.remaining(t_ns)
         values = self._status(t_ns)._replace(state=DetectorState.STOPPING)
-        return [self._encoder.status(t_ns, values)._replace(channel=self._channel)]
+        return [*answers, self._encoder.status(t_ns, values)._replace(channel=self._channel)]
 
     def _status(self, t_ns: int) -> StatusValues:
         if self._seen_ns is None:

@@ -3,19 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Protocol
 
-from can_imm.runtime.nodes import Listener, Reports
-
-
-class Smoother(Protocol):
-    """What goes back over the detector's tracks, see `can_imm.smoothing`."""
-
-    def due(self, t_ns: int) -> Iterable[tuple[int, Reports]]:
-        """Give out the scans of which all is known at the step of ``t_ns``: time and reports."""
-
-    def finish(self) -> Iterable[tuple[int, Reports]]:
-        """Give out what is left."""
+from can_imm.runtime.nodes import Listener, Reports, Smoother
 
 
 class Smoothed:

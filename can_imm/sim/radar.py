@@ -37,6 +37,8 @@ class RadarModel:
             polar: of range, range rate [m, m/s] and bearing [rad].
         wander: standard deviation of the slowly changing errors of x and y [m].
         wander_time: their correlation time [s].
+        bearing: standard deviation of an error of the bearing that all tracks share and that
+            wanders in the same way [rad].
         slots: number of tracks that it can hold; their ids are 0 to slots - 1.
         in_turn: a new track takes the id after the last one given; otherwise the lowest free one.
         hold: a track whose object is out of view ends after so long [s].
@@ -56,6 +58,7 @@ class RadarModel:
     polar: bool = False
     wander: tuple[float, float] = (0.0, 0.0)
     wander_time: float = 1.0
+    bearing: float = 0.0
     slots: int = 64
     in_turn: bool = True
     hold: float = 0.4
@@ -92,11 +95,13 @@ RADARS = {
         ),
         RadarModel(
             "toyota", 0.05, (0.08, 0.06, 0.08, _NAN), wander=(0.12, 0.2), wander_time=0.4,
-            slots=16, in_turn=False, hold=0.0, rest=0.0, missed=0.01, dropout=0.002, duplicates=0.003,
+            bearing=0.004, slots=16, in_turn=False, hold=0.0, rest=0.0, missed=0.01, dropout=0.002,
+            duplicates=0.003,
         ),
         RadarModel(
             "toyota-tss2", 0.05, (0.08, 0.06, 0.08, _NAN), wander=(0.12, 0.2), wander_time=0.4,
-            slots=16, in_turn=False, hold=0.0, rest=0.0, missed=0.01, dropout=0.002, duplicates=0.003,
+            bearing=0.004, slots=16, in_turn=False, hold=0.0, rest=0.0, missed=0.01, dropout=0.002,
+            duplicates=0.003,
         ),
         RadarModel(
             "esr", 0.05, (0.2, 0.1, radians(0.4)), polar=True, slots=64, in_turn=False, rest=0.2,
@@ -190,6 +195,7 @@ class _Observer:
         self.valid = np.isfinite(std) & ([True, True, True, not radar.polar])
         self.std = np.where(self.valid, std, 1.0)
         self.stay = exp(-radar.period / radar.wander_time)
+        self.bearing = radar.bearing * self.noise * rng.standard_normal()
 
     def run(self) -> Measured:
         truth, radar, rng = self.truth, self.radar, self.rng
@@ -322,7 +328,11 @@ class _Observer:
             scan.std[:n, :2] = self.std[:2]
             scan.std[:n, Y] = scan.z[:n, X] * self.std[2]
             return scan
+        if radar.bearing:
+            fresh = sqrt(1.0 - self.stay**2) * radar.bearing * self.noise
+            self.bearing = self.stay * self.bearing + fresh * self.rng.standard_normal()
         error = np.array([track.error for track in tracks])
+        error[:, 1] += self.bearing * states[:, X]
         scan.z[:n] = np.where(self.valid, states + errors * self.std * self.noise, 0.0)
         scan.z[:n, X] += error[:, 0]
         scan.z[:n, Y] += error[:, 1]

@@ -2,9 +2,13 @@ from __future__ import annotations
 
 import shutil
 
+import numpy as np
 import pytest
 from bus_frames import ROOT
 
+from can_imm.bus.decoder import ScanDecoder
+from can_imm.bus.describe import describe
+from can_imm.bus.frame import Frame
 from can_imm.bus.profile import builtin_profiles, load_profile
 from can_imm.types import CanImmError
 
@@ -79,6 +83,12 @@ def test_a_bad_profile_is_refused_in_one_line(tmp_path, old, new, reason):
 
 
 BAD_NEW = [
+    ("toyota", "std = 0.25 ", "std = 0.25, std_per_m = 0.01 ", "x: 'std_per_m' is for y"),
+    ("toyota", "std = 0.15 ", "std = 0.15, std_per_m = 0.01 ", "vx: 'std_per_m' is for y"),
+    ("ars408", "std = 0.3, ", "std = 0.3, std_per_m = 0.01, ", "'std_per_m' is for y"),
+    ("esr", "std = 0.5 }", "std = 0.5, std_per_m = 0.01 }", "bearing: 'std_per_m' is for y"),
+    ("toyota", "std_per_m = 0.012", "std_per_m = -0.012", "y: 'std_per_m' must be a number from 0"),
+    ("toyota", "std_per_m = 0.012", "std_per_m = nan", "y: 'std_per_m' must be a number from 0"),
     ("ars408", "number = 8", "number = 0", "sensors: 'number' must be a whole number from 1"),
     ("ars408", "number = 8", "number = 8\nuse = 8", "sensors: 'use' must be a whole number from 0"),
     ("ars408", "new_codes = [1, 5]", "new_codes = [1.5]", "'new_codes' must be a list of whole"),
@@ -153,6 +163,55 @@ def test_object_messages_must_scale_alike(tmp_path):
     shutil.copy(ROOT / "dbc" / "toyota.toml", tmp_path)
     with pytest.raises(CanImmError, match="'LONG_DIST' of TRACK_A_3 has another scale"):
         load_profile(str(tmp_path / "toyota.toml"))
+
+
+def profile_with(tmp_path, name, old, new):
+    """The built-in profile of that name with one change."""
+    text = (ROOT / "dbc" / f"{name}.toml").read_text()
+    assert text.count(old) == 1
+    (tmp_path / f"{name}.toml").write_text(text.replace(old, new))
+    shutil.copy(ROOT / "dbc" / f"{name}.dbc", tmp_path)
+    return load_profile(str(tmp_path / f"{name}.toml"))
+
+
+OWN_Y = 'y = { signal = "DistLat", std = 0.2'
+
+
+@pytest.mark.parametrize(
+    ("more", "expected"),
+    [
+        # the rounding to steps of some centimetres is less than a hundredth of these
+        ("", {10.0: 0.2, 100.0: 0.2}),
+        (", std_per_m = 0.0", {10.0: 0.2, 100.0: 0.2}),
+        (", std_per_m = 0.015", {10.0: 0.25, 100.0: 1.513275}),
+        (', std_per_m = 0.015, unit = "cm"', {10.0: 0.0025, 100.0: 0.01513275}),
+    ],
+)
+def test_std_per_m_is_added_in_quadrature(tmp_path, radar, more, expected):
+    decoder = ScanDecoder(profile_with(tmp_path, "can_imm", OWN_Y, OWN_Y + more))
+    frames = [radar.scan(len(expected))]
+    frames += [radar.object(k, DistLong=x, DistLat=-3.0) for k, x in enumerate(expected)]
+    (scan,) = (found for frame in frames if (found := decoder.feed(Frame(0, *frame))))
+    assert scan.z[: scan.n, 0].tolist() == pytest.approx(list(expected))
+    assert scan.std[: scan.n, 2].tolist() == pytest.approx(list(expected.values()), rel=0.01)
+    others = scan.std[: scan.n, [0, 1, 3]]
+    assert others == pytest.approx(np.tile([0.1, 0.3, 0.3], (scan.n, 1)), rel=0.05)
+
+
+def test_profiles_check_tells_of_std_per_m(tmp_path):
+    def of_y(profile):
+        ((line, _),) = (
+            (line, part)
+            for part, lines in describe(profile)
+            for line in lines
+            if line.startswith("y ")
+        )
+        return line
+
+    assert of_y(load_profile("toyota")).endswith("and rounding), and 0.012 per metre ahead")
+    assert "per metre" not in of_y(load_profile("can_imm"))
+    changed = profile_with(tmp_path, "can_imm", OWN_Y, OWN_Y + ", std_per_m = 0.02")
+    assert "(0.2 and rounding), and 0.02 per metre ahead" in of_y(changed)
 
 
 @pytest.mark.parametrize("name", ["ars999", "", "none.toml", "sub/none"])

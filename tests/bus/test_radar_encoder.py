@@ -130,8 +130,21 @@ def test_ego_motion_comes_back(name, speed, turn):
     }
     if name == "toyota":
         speed = max(speed, -67.67 / 3.6)
+    if name == "ars408" and abs(speed) < 0.05:
+        speed = abs(speed)  # standstill, neither forwards nor backwards
     assert abs(back[0] - speed) <= exact[name][0] / 2 + 1e-9
     assert abs(back[1] - turn) <= exact[name][1] / 2 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("speed", "direction", "raw"),
+    [(20, 1, 1000), (0.06, 1, 3), (0.04, 0, 2), (0, 0, 0), (-0.04, 0, 2), (-0.06, 2, 3)],
+)
+def test_the_ars408_is_told_which_way_the_vehicle_goes(speed, direction, raw):
+    """SpeedInformation: two bits of direction, one without meaning, 13 of speed in 0.02 m/s."""
+    frames = ProfileEncoder(PROFILES["ars408"]).encode_ego(speed, 0.1, 0)
+    [data] = [frame.data for frame in frames if frame.id == 0x300]
+    assert int.from_bytes(data, "big") == direction << 14 | raw
 
 
 def test_ego_motion_that_is_not_known():

@@ -81,6 +81,28 @@ def test_answers_on_the_bus_until_sigterm(can_imm, tmp_path):
     assert recorded[-1].data[1] >> 4 & 7 == 3
 
 
+def test_lagged_answers_on_the_bus_are_those_of_a_replay(can_imm, tmp_path):
+    log, again = tmp_path / "all.log", tmp_path / "again.log"
+    with Neighbour("lag-test", 8) as neighbour:
+        status, _, _ = can_imm(
+            "detect", "-i", "virtual", "-c", "lag-test", "--log", log, "--lag", 0.45
+        )
+    assert status == 0
+    assert can_imm("replay", log, "--lag", 0.45, "--out", again)[0] == 0
+    live, replayed = ([f for f in LogSource(path) if f.id != 0x31F] for path in (log, again))
+    assert live == replayed
+    times = {i: [f.t_ns for f in live if f.id == i] for i in (0x301, 0x310)}
+    assert len(times[0x310]) == 8
+    waits = [(b - a) / 1e9 for a, b in zip(times[0x301], times[0x310], strict=True)]
+    assert waits[:3] == pytest.approx([0.46] * 3, abs=0.02)
+    assert max(waits) < 0.5
+    # the last ones, which wait no longer, before the word that it stops
+    assert waits[-1] < 0.44
+    assert [m.arbitration_id for m in neighbour.heard].count(0x310) < 8
+    with LogSource(log) as source:
+        assert [f.id for f in source][-3:] == [0x310, 0x311, 0x31F]
+
+
 def test_duration_ends_it(can_imm):
     status, out, _ = can_imm("detect", "-i", "virtual", "-c", "duration-test", "--duration", 0.3)
     assert status == 0

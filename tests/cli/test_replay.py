@@ -13,9 +13,12 @@ import numpy as np
 import pytest
 
 from can_imm.bus.encoder import OUTPUT_IDS
-from can_imm.bus.listener import EstimateMessage, ManoeuvreDecoder
+from can_imm.bus.listener import EstimateMessage, ManoeuvreDecoder, ManoeuvreMessage
+from can_imm.bus.profile import load_profile
+from can_imm.bus.radar_encoder import ProfileEncoder
 from can_imm.bus.sinks import LogSink
 from can_imm.bus.sources import LogSource
+from can_imm.types import Manoeuvre, Scan
 
 COLUMNS = (
     "time_s,object_id,manoeuvre,probability,lane,direction,x,vx,y,vy,p_keep_right,p_lane_change,"
@@ -161,6 +164,7 @@ def test_realtime_takes_as_long_as_the_log(can_imm, log, tmp_path):
         (["{log}", "--sensor", "3"], "not 3"),
         (["{log}", "--lag", "-1"], "-1"),
         (["{log}", "--lag", "nan"], "nan"),
+        (["{log}", "--lag", "0"], "a step of the loop or longer, not 0 s"),
     ],
 )
 def test_refusals_are_one_line(can_imm, log, arguments, named):
@@ -288,14 +292,14 @@ def test_what_takes_one_log_is_refused_with_several(can_imm, log, tmp_path, opti
 
 @pytest.mark.parametrize("option", [("--smooth",), ("--lag", "1.0")])
 def test_hindsight_knows_of_the_lane_change_from_its_beginning(can_imm, log, tmp_path, option):
-    """Same rows and frames; fewer wrong labels than at the time; the picture and the events too."""
+    """Same rows; fewer wrong labels than at the time; the picture and the events too."""
     plain, better = tmp_path / "plain.csv", tmp_path / "better.csv"
     frames, again = tmp_path / "frames.log", tmp_path / "again.log"
     events, picture = tmp_path / "events.csv", tmp_path / "drive.png"
     assert can_imm("replay", log, "--csv", plain, "--out", frames)[0] == 0
     files = ("--csv", better, "--out", again, "--events", events, "--plot", picture)
     assert can_imm("replay", log, *option, *files)[0] == 0
-    assert again.read_bytes() == frames.read_bytes()
+    assert (again.read_bytes() == frames.read_bytes()) == (option == ("--smooth",))
     before, after = rows_of(plain.read_text()), rows_of(better.read_text())
     for column in ("time_s", "object_id"):
         assert [row[column] for row in after] == [row[column] for row in before]
@@ -315,6 +319,61 @@ def test_both_kinds_of_hindsight_are_one_too_many(can_imm, log):
     status, _, err = can_imm("replay", log, "--smooth", "--lag", "1")
     assert status == 2
     assert "not both" in err
+
+
+@pytest.mark.parametrize(
+    ("speed", "said"),
+    [
+        (30.0, "20 frames"),
+        (160.0, "20 frames; impossible in 10 scans"),
+        (None, "not on this bus: nothing is said to stand still"),
+    ],
+)
+def test_the_summary_says_what_was_heard_of_the_ego_motion(can_imm, tmp_path, speed, said):
+    path, encoder = tmp_path / "drive.log", ProfileEncoder(load_profile("ars408"))
+    scan = Scan(1)
+    scan.n, scan.ids[0], scan.z[0], scan.valid[0] = 1, 5, (40.0, 0.0, 0.0, 0.0), True
+    with LogSink(path) as sink:
+        for t_ns in range(0, 1_000_000_000, 100_000_000):
+            ego = [] if speed is None else encoder.encode_ego(speed, 0.0, t_ns)
+            for frame in ego + encoder.encode(scan, t_ns):
+                sink.send(frame)
+    status, out, _ = can_imm("replay", path, "--profile", "ars408", "--preset", "motorway")
+    assert status == 0
+    [line] = [line for line in out.splitlines() if line.startswith("  ego motion ")]
+    line = line.removeprefix("  ego motion ").strip()
+    assert line == said if speed else line.startswith(said)
+    assert "rejected   0\n" in out
+
+
+def test_lagged_frames_come_late_and_say_what_the_csv_says(can_imm, log, tmp_path):
+    """Each scan's a second after the scan, those of the last second in the last step."""
+    out, table = tmp_path / "out.log", tmp_path / "said.csv"
+    assert can_imm("replay", log, "--lag", "1", "--out", out, "--csv", table)[0] == 0
+    decoder, rows = ManoeuvreDecoder(), rows_of(table.read_text())
+    seen = [(frame.t_ns, decoder.feed(frame)) for frame in LogSource(out)]
+    states = [(t, m) for t, m in seen if isinstance(m, ManoeuvreMessage)]
+    assert [t for t, _ in states] == [min(10 + k, 60) * 100_000_000 for k in range(61)]
+    assert [Manoeuvre(m.manoeuvre).name for _, m in states] == [r["manoeuvre"] for r in rows]
+    places = [(m.x, m.y) for _, m in seen if isinstance(m, EstimateMessage)]
+    wanted = [(float(row["x"]), float(row["y"])) for row in rows]
+    assert np.array(places) == pytest.approx(np.array(wanted), abs=0.04)
+
+
+def test_a_replay_of_a_lagged_replay_changes_nothing(can_imm, log, tmp_path):
+    once, twice = tmp_path / "once.log", tmp_path / "twice.log"
+    assert can_imm("replay", log, "--lag", "0.5", "--out", once)[0] == 0
+    assert can_imm("replay", once, "--lag", "0.5", "--out", twice)[0] == 0
+    assert twice.read_bytes() == once.read_bytes()
+
+
+def test_lagged_estimates_at_every_step_are_refused(can_imm, log, tmp_path):
+    out = tmp_path / "out.log"
+    for command in (["replay", log, "--out", out], ["detect", "-i", "virtual", "--log", out]):
+        status, said, err = can_imm(*command, "--lag", "1", "--estimates", "step")
+        assert (status, said) == (2, "")
+        assert "not both" in err.splitlines()[-1]
+        assert not out.exists()
 
 
 def test_estimates_at_every_step(can_imm, log, tmp_path):

@@ -167,6 +167,7 @@ def test_the_ego_drives_along_the_road(seed: int, v: float, yaw_rate: float) -> 
     assert x[OFFSET] == pytest.approx(offset, abs=4e-3)
     assert x[HEADING] == pytest.approx(heading, abs=4e-4)
     assert x[CURVATURE] == pytest.approx(curvature, abs=1e-6)
+    still[BIAS] *= math.exp(-0.4 / road.BIAS_TIME)
     np.testing.assert_allclose(x[[CHANGE, BIAS, MOUNTING, WIDTH]], still[[3, 4, 5, 6]], rtol=1e-9)
 
 
@@ -191,6 +192,7 @@ def test_the_covariance_moves_with_the_state(seed: int, known: bool) -> None:
     v, dt, w = 30.0, 0.1, 0.02
     F = np.eye(N)
     F[OFFSET, HEADING] = v * dt
+    F[BIAS, BIAS] = math.exp(-dt / road.BIAS_TIME)
     F[CURVATURE, CHANGE] = v * dt
     if known:
         F[HEADING, CURVATURE], F[HEADING, BIAS] = -v * dt, -dt
@@ -331,7 +333,7 @@ def test_the_covariance_follows_when_the_lanes_are_counted_anew() -> None:
     traffic.x[OFFSET] = 2.0
     x, P = traffic.x.copy(), traffic.P.copy()
     moved = road.watch_traffic_(
-        traffic.x, traffic.P, traffic.par, traffic.guide_slot, traffic.guide_unseen,
+        traffic.x, traffic.P, traffic.par, traffic.guide_slot, traffic.guide_unseen, np.ones(1),
         traffic.bank, traffic.objects, 0, np.zeros(0, np.int32), np.zeros(0, np.int8),
         traffic.age, np.zeros((0, 4)), np.zeros((0, 4)), np.zeros((0, 4), np.bool_),
         np.zeros(0), 0.1,

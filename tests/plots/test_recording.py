@@ -179,11 +179,11 @@ def test_history_keeps_what_it_was_told():
 def test_the_middle_of_the_lane_is_the_road_filter_s():
     random = np.random.default_rng(2)
     states = random.normal(size=(20, road.N_ROAD)) * [0.5, 0.02, 1e-3, 1e-5, 0.01, 0.01, 0.1]
-    x, row = random.uniform(0, 150, 20), np.zeros(road.N_ROAD)
+    x, row = random.uniform(-50, 200, 20), np.zeros(road.N_ROAD + 1)
     expected = []
     for state, distance in zip(states, x, strict=True):
-        road.lane_row_(row, distance, 0.0)
-        expected.append(row @ state)
+        road.lane_row_(row, distance)
+        expected.append(row[: road.N_ROAD] @ state)
     assert lane_middle(states, x) == pytest.approx(np.array(expected))
 
 

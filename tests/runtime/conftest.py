@@ -64,9 +64,10 @@ def profile():
 def make_node(profile):
     """Return a function that builds a fresh detector node around a HashDetector."""
 
-    def make(health: Health | None = None, listeners=()) -> DetectorNode:
+    def make(health: Health | None = None, listeners=(), **options) -> DetectorNode:
         return DetectorNode(
-            ScanDecoder(profile), HashDetector(), ManoeuvreEncoder(), health or Health(), listeners
-        )
+            ScanDecoder(profile), HashDetector(), ManoeuvreEncoder(), health or Health(), listeners,
+            **options,
+        )  # fmt: skip
 
     return make

@@ -24,6 +24,7 @@ from can_imm.runtime.health import Health
 from can_imm.runtime.loop import STEP_NS, Loop, run
 from can_imm.runtime.nodes import DetectorNode, SenderNode
 from can_imm.sim.player import Player
+from can_imm.smoothing import FixedLagSmoother
 from can_imm.types import Scan
 
 UNIX_NS = 1_700_000_000_000_000_000
@@ -73,12 +74,15 @@ def replayed(path: Path, make_node) -> list[tuple[int, int, bytes]]:
     health, keep = Health(), Keep()
     with LogSource(path) as source:
         feed = LogFeed(source, FastClock(), health, OUTPUT_IDS)
-        run([Loop(feed, make_node(health), health, recorders=[keep])])
+        node = make_node(health)
+        loop = Loop(feed, node, health, recorders=[keep])
+        run([loop])
+        loop.send_last(node.remaining)
     return manoeuvres(keep.frames)
 
 
-def fast_run(bus_pair, make_node, *recorders) -> None:
-    """Sender and detector in lockstep on a virtual bus."""
+def fast_run(bus_pair, make_node, *recorders) -> Loop:
+    """Sender and detector in lockstep on a virtual bus; returns the detector's loop."""
     clock = FastClock(UNIX_NS)
     sender_bus, detector_bus = bus_pair
     health = Health()
@@ -90,6 +94,7 @@ def fast_run(bus_pair, make_node, *recorders) -> None:
     detector = Loop(feed, make_node(health), health, [BusSink(detector_bus)], recorders)
     run([sender, detector], stop=lambda: player.done and health.frames >= 100 + 150)
     assert health.late_frames == 0
+    return detector
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -192,4 +197,32 @@ def test_the_real_detector_repeats_itself(bus_pair, tmp_path, suffix, profile):
         fast_run(bus_pair, make_node, keep, log)
     live = manoeuvres(keep.frames)
     assert len(live) > 300
+    assert replayed(path, make_node) == live
+
+
+@pytest.mark.parametrize("lag_s", [0.3, 100.0])
+def test_lagged_answers_repeat_themselves_to_the_last(bus_pair, tmp_path, profile, lag_s):
+    """Those that are said at the end of the live run, too; with 100 s these are all."""
+    bank = load_bank("two-lane")
+    nodes: list[DetectorNode] = []
+
+    def make_node(health: Health) -> DetectorNode:
+        detector = Detector(bank)
+        detector.history = smoother = FixedLagSmoother(bank, lag_s)
+        nodes.append(
+            DetectorNode(
+                ScanDecoder(profile), detector, ManoeuvreEncoder(), health, smoother=smoother
+            )
+        )
+        return nodes[-1]
+
+    path, keep = tmp_path / "run.log", Keep()
+    with LogSink(path) as log:
+        loop = fast_run(bus_pair, make_node, keep, log)
+        before = len(manoeuvres(keep.frames))
+        loop.send_last(nodes[0].farewell)
+    live = manoeuvres(keep.frames)
+    assert len(live) > max(300, before)
+    assert (before > 0) == (lag_s < 1)
+    assert keep.frames[-1].id == STATUS_ID
     assert replayed(path, make_node) == live

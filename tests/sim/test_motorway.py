@@ -79,8 +79,8 @@ def test_a_road_of_linear_curvature_is_a_clothoid() -> None:
 def test_random_roads_bend_gently_both_ways() -> None:
     roads = [random_road(np.random.default_rng(seed), 0.0, 5000.0) for seed in range(20)]
     kappa = np.stack([road.curvature[:5000] for road in roads])
-    assert np.abs(kappa).max() <= 1 / 800.0
-    assert np.abs(np.diff(kappa, axis=1)).max() <= 1 / 800.0 / 80.0 + 1e-12
+    assert 0.9 / 1000.0 < np.abs(kappa).max() <= 1 / 1000.0
+    assert np.abs(np.diff(kappa, axis=1)).max() <= 1 / 1000.0 / 120.0 + 1e-12
     assert (kappa > 1e-4).any()
     assert (kappa < -1e-4).any()
     assert 0.2 < np.mean(kappa == 0.0) < 0.7
@@ -327,6 +327,10 @@ def test_lane_changes_go_one_lane_in_their_time(drives: list[MotorwayTruth]) -> 
         settings = TUNING if truth in drives[:20] else REPORTING
         width = truth.scenario.lane_width
         for target in traffic(truth):
+            wander = wander_of(truth, target)
+            middle = target.d - wander
+            # sum(a²) = 2 σ² bounds the sum of the sines by √(2 n) σ
+            assert np.abs(wander).max() <= np.sqrt(2 * 6) * settings.wander[1] + 1e-9
             changes = [run[1:] for run in runs(target) if run[0] == Manoeuvre.LANE_CHANGE]
             for begin, end in (
                 [target.sample(round(t * 1e9)) for t in change] for change in changes
@@ -335,16 +339,15 @@ def test_lane_changes_go_one_lane_in_their_time(drives: list[MotorwayTruth]) -> 
                     continue
                 if len(set(target.direction[begin : end + 1])) > 1:
                     continue  # there and straight back again
-                moved = target.d[end + 1] - target.d[begin]
+                moved = middle[end + 1] - middle[begin]
                 lanes = round(moved / width)
                 low, high = settings.change_time
                 assert low - 0.02 <= (end - begin + 1) * 0.01 / abs(lanes) <= high + 0.02
-                assert abs(moved - lanes * width) < 0.8
+                assert abs(moved - lanes * width) < 1e-3
                 assert np.sign(moved) == target.direction[begin]
                 count += abs(lanes) == 1
-            still = target.direction == 0
-            wander = target.d[still] / width
-            assert np.abs(wander - np.rint(wander)).max(initial=0.0) < 0.2
+            lane = middle[target.direction == 0] / width
+            assert np.abs(lane - np.rint(lane)).max(initial=0.0) < 1e-3
     assert count > 200
 
 
@@ -395,6 +398,16 @@ def is_of(d: Driver, target: ObjectTruth) -> bool:
     return bool(d.start <= t[0] + 1e-9 and abs(d.along(t)[0][0] - target.station[0]) < 1e-9)
 
 
+def sines(d: Driver, t: np.ndarray) -> np.ndarray:
+    """The driver's wander [m] at times t [s]."""
+    return sum(a * np.sin(omega * t + phase) for a, omega, phase in d.wander)
+
+
+def wander_of(truth: MotorwayTruth, target: ObjectTruth) -> np.ndarray:
+    (d,) = (d for d in truth.scenario.drivers if is_of(d, target))
+    return sines(d, target.t_ns * 1e-9)
+
+
 def test_wander_has_the_stated_deviation_and_is_slow() -> None:
     settings = replace(plain(TUNING), duration=600.0, ego_change_rate=0.0, vehicles=(4, 4))
     deviations = []
@@ -403,10 +416,15 @@ def test_wander_has_the_stated_deviation_and_is_slow() -> None:
         d = truth.ego.d / truth.scenario.lane_width
         off = (d - np.rint(d)) * truth.scenario.lane_width
         deviations.append(off.std())
+        stated = np.sqrt((truth.scenario.ego.wander[:, 0] ** 2).sum() / 2.0)
+        assert off.std() == pytest.approx(stated, rel=0.07)
         later = np.corrcoef(off[:-100], off[100:])[0, 1]
         assert later > 0.5  # after 1 s
         assert np.abs(truth.ego.yaw_rate).max() < 0.02
-    assert 0.09 < min(deviations) < max(deviations) < 0.16
+    # sines of nearly equal periods beat over longer than the drive: some per cent
+    low, high = settings.wander
+    assert 0.93 * low < min(deviations) < max(deviations) < 1.07 * high
+    assert max(deviations) - min(deviations) > 0.4 * (high - low)
 
 
 def test_switches() -> None:

@@ -94,16 +94,51 @@ def test_noise_is_what_it_says(name: str) -> None:
             error = (z[:, k] - [x0, 0.0, y0, 0.0])[:, measured]
             assert not angle[:, k].any()
         stated = std[:, k].mean(axis=0)[: error.shape[1]]
-        # a wandering error has few independent values: 600 s / (2 · 4 s)
-        few = 0.12 if any(radar.wander) else 0.04
-        np.testing.assert_allclose(np.sqrt((error**2).mean(axis=0)), stated, rtol=few)
+        # the error of the bearing that all tracks share is told by the profile, not by the scan
+        whole = np.hypot(stated, [0.0, 0.0, radar.bearing * x0, 0.0][: error.shape[1]])
+        # a wandering error has few independent values: 600 s / .4 s
+        few = 0.06 if any(radar.wander) else 0.04
+        np.testing.assert_allclose(np.sqrt((error**2).mean(axis=0)), whole, rtol=few)
         assert np.abs(error.mean(axis=0)).max() < 0.06
         steps = np.corrcoef(error[1:].T, error[:-1].T)
         n = error.shape[1]
         for i in range(n):
-            slow = any(radar.wander) and i in (0, 2)
-            expected = 0.1**2 / (0.1**2 + 0.15**2) if slow else 0.0
-            assert steps[i, n + i] == pytest.approx(expected, abs=0.08)
+            white = radar.std[i] if any(radar.wander) else stated[i]
+            lasting = 1.0 - (white / whole[i]) ** 2
+            expected = lasting * np.exp(-radar.period / radar.wander_time)
+            assert steps[i, n + i] == pytest.approx(expected, abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["toyota", "toyota-tss2"])
+def test_what_the_toyota_radars_errors_are(name: str) -> None:
+    radar = RADARS[name]
+    assert radar.std[:3] == (0.08, 0.06, 0.08)
+    assert (radar.wander, radar.wander_time, radar.bearing) == ((0.12, 0.2), 0.4, 0.004)
+
+
+@pytest.mark.parametrize("noise", [1.0, 1.5])
+def test_all_tracks_share_the_error_of_the_bearing(noise: float) -> None:
+    truth = still_picture((40.0, 3.5), (20.0, -3.5), (90.0, 0.0), duration=600.0)
+    truth = drive(replace(truth.scenario, noise=noise))
+    radar = replace(RADARS["toyota"], std=(1e-9, 1e-9, 1e-9, np.nan), wander=(0.0, 0.0), **QUIET)
+    seen = watch(truth, radar)
+    z = np.array([scan.z[:3] for scan in seen.scans])
+    states = np.array(seen.states)
+    np.testing.assert_allclose(z[:, :, :2], states[:, :, :2], atol=1e-7)
+    turned = (z - states)[:, :, 2] / states[:, :, 0]
+    np.testing.assert_allclose(turned, turned[:, :1] * np.ones(3), atol=1e-9)
+    error = turned[:, 0]
+    assert np.sqrt((error**2).mean()) == pytest.approx(0.004 * noise, rel=0.06)
+    assert abs(error.mean()) < 0.0005 * noise
+    # 8 periods of .05 s are the .4 s in which it wanders
+    assert np.corrcoef(error[:-1], error[1:])[0, 1] == pytest.approx(np.exp(-1 / 8), abs=0.02)
+    assert np.corrcoef(error[:-8], error[8:])[0, 1] == pytest.approx(np.exp(-1), abs=0.08)
+    # and it does not begin with 0
+    firsts = [
+        watch(still_picture((50.0, 0.0), duration=1.0), radar, seed).scans[0].z[0, 2] / 50.0
+        for seed in range(40)
+    ]
+    assert np.std(firsts) == pytest.approx(0.004, rel=0.35)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -12,6 +12,7 @@ from hypothesis.extra import numpy as hnp
 
 from can_imm.studies import metrics
 from can_imm.studies.metrics import evaluate, expected_calibration_error, summarise
+from can_imm.types import N_MANOEUVRES
 
 SCAN_NS = 100_000_000
 
@@ -91,7 +92,7 @@ def test_tolerance_accepts_neither_a_third_label_nor_a_frame_further_off():
 
 
 def test_brier_and_calibration_by_hand():
-    p = np.zeros((4, 8))
+    p = np.zeros((4, N_MANOEUVRES))
     p[0, [1, 2]] = 0.75, 0.25
     p[1, [1, 2]] = 0.75, 0.25
     p[2, [1, 2, 3]] = 0.2, 0.5, 0.3
@@ -104,7 +105,7 @@ def test_brier_and_calibration_by_hand():
 
 
 def test_certain_and_right_is_perfect():
-    p = np.zeros((3, 8))
+    p = np.zeros((3, N_MANOEUVRES))
     p[:, 4] = 1.0
     m = run([4, 4, 4], [4, 4, 4], p)
     assert (m.brier, m.ece, m.accuracy, m.macro_f1) == (0.0, 0.0, 1.0, 1.0)
@@ -154,7 +155,7 @@ LABELS = st.integers(1, 60).flatmap(
         hnp.arrays(np.int8, n, elements=st.integers(1, 3)),
         hnp.arrays(np.int8, n, elements=st.integers(0, 3)),
         hnp.arrays(np.int64, n, elements=st.integers(1, 4)),
-        hnp.arrays(float, (n, 8), elements=st.floats(0.001, 1.0)),
+        hnp.arrays(float, (n, N_MANOEUVRES), elements=st.floats(0.001, 1.0)),
     )
 )
 
@@ -221,7 +222,7 @@ def test_summary_gives_mean_and_standard_error_and_skips_what_does_not_exist():
 
 def test_summary_pools_the_frames_before_the_calibration_error():
     """Two runs, each off by .2 in the other direction: alone .2 each, together calibrated."""
-    p = np.zeros((10, 8))
+    p = np.zeros((10, N_MANOEUVRES))
     p[:, 1], p[:, 2] = 0.75, 0.25
     runs = [run([1] * 10, [1] * 10, p), run([1] * 5 + [2] * 5, [1] * 10, p)]
     assert [r.ece for r in runs] == pytest.approx([0.25, 0.25])
