@@ -79,6 +79,7 @@ class RoadFrame:
 
     def localise_(self, scan: Scan, z: FloatArray, r: FloatArray) -> None:
         """Measurements z, r (N, 4) of the scan into the road's axes, in place."""
+        r[: scan.n, 2] += np.square(scan.lasting[: scan.n])
         road.localise_(self.x, self.P, self._par, scan.n, z, r, scan.valid, scan.angle, self._speed)
 
     def watch_(
@@ -87,6 +88,7 @@ class RoadFrame:
         """Update the road by the traffic; see `estimation.road.watch_traffic_`."""
         with np.errstate(over="ignore"):  # a row that is not used may say anything
             r = np.square(scan.std)
+            r[:, 2] += np.square(scan.lasting)
         return int(
             road.watch_traffic_(
                 self.x, self.P, self._par, self._guide_slot, self._guide_unseen, self._unrest,

@@ -61,6 +61,8 @@ class Scan:
             object, ``z`` is (range, range rate, 0, -) and the noise is independent in these axes.
         z: (capacity, 4) measured x, vx, y, vy [m, m/s, m, m/s], in axes turned by ``angle``.
         std: (capacity, 4) standard deviations of ``z``, same units.
+        lasting: (capacity,) standard deviation of errors across the line of sight that last for
+            longer than a scan [m]: white noise of this size does the same harm.
         valid: (capacity, 4) which components were measured; the others' values mean nothing.
         new: (capacity,) the sensor says that this id names another object than in its last scan.
         existence: (capacity,) probability that the object exists; 1 from a sensor that gives none.
@@ -70,8 +72,8 @@ class Scan:
     """
 
     __slots__ = (
-        "angle", "counter", "ego_speed", "ego_yaw_rate", "existence", "ids", "incomplete", "n",
-        "new", "object_class", "size", "std", "t_ns", "valid", "z",
+        "angle", "counter", "ego_speed", "ego_yaw_rate", "existence", "ids", "incomplete",
+        "lasting", "n", "new", "object_class", "size", "std", "t_ns", "valid", "z",
     )  # fmt: skip
 
     def __init__(self, capacity: int) -> None:
@@ -84,6 +86,7 @@ class Scan:
         self.ids: IntArray = np.zeros(capacity, np.int32)
         self.z: FloatArray = np.zeros((capacity, 4))
         self.std: FloatArray = np.ones((capacity, 4))
+        self.lasting: FloatArray = np.zeros(capacity)
         self.valid: BoolArray = np.zeros((capacity, 4), np.bool_)
         self.new: BoolArray = np.zeros(capacity, np.bool_)
         self.existence: FloatArray = np.ones(capacity)
@@ -106,7 +109,8 @@ class Scan:
         )
         self.ego_speed, self.ego_yaw_rate = other.ego_speed, other.ego_yaw_rate
         for name in (
-            "ids", "angle", "z", "std", "valid", "new", "existence", "object_class", "size",
+            "ids", "angle", "z", "std", "lasting", "valid", "new", "existence", "object_class",
+            "size",
         ):  # fmt: skip
             getattr(self, name)[:n] = getattr(other, name)[:n]
 

@@ -216,8 +216,8 @@ def _component(profile: Profile, name: str, part: Component) -> tuple[str, str]:
     if part.std_from is not None:
         line += f", or that of {part.std_from.signal}"
         line += f", at least {part.std_floor:g}" if part.std_floor else ""
-    if part.std_per_m:
-        line += f", and {part.std_per_m:g} per metre ahead"
+    if part.std_lasting or part.std_per_m:
+        line += f"; lasting errors of {part.std_lasting:g} and {part.std_per_m:g} per metre ahead"
     if scaling.missing is not None:
         line += f"; raw {scaling.missing}: not available"
     texts = []

@@ -33,6 +33,7 @@ class ObjectList:
             else:
                 self._defaults[state] = 1.0
         across = profile.state[Y]
+        self._lasting = across.std_lasting * across.factor if across else 0.0
         self._per_m = across.std_per_m * across.factor if across else 0.0
         self._stds = any(column < 4 for column in self._columns)
         self._also = layout.also + 1
@@ -116,9 +117,8 @@ class ObjectList:
             scan.existence[:n] = table[:, EXISTENCE]
             scan.object_class[:n] = table[:, CLASS]
             scan.size[:n] = table[:, [LENGTH, WIDTH]]
-        if self._per_m:
-            std = scan.std[:n, 2] if self._stds else self._defaults[2]
-            np.hypot(std, self._per_m * z[:, 0], out=scan.std[:n, 2])
+        if self._lasting or self._per_m:
+            np.hypot(self._lasting, self._per_m * z[:, 0], out=scan.lasting[:n])
         if self._polar:
             self._to_cartesian_axes(scan, n)
 

@@ -32,8 +32,8 @@ class Component:
 
     ``std``, ``std_floor`` and ``offset`` are in the signal's unit, ``unit``; ``factor`` takes it to
     SI units.  ``std_from`` is the signal with which the sensor sends its own standard deviation,
-    not believed below ``std_floor``.  ``std_per_m``, in the unit per metre of distance ahead, is
-    added in quadrature: an error of the bearing.
+    not believed below ``std_floor``.  ``std_lasting`` and, in the unit per metre of distance ahead,
+    ``std_per_m`` are errors that last for longer than a scan.
     """
 
     signal: str
@@ -44,6 +44,7 @@ class Component:
     factor: float
     std_from: Code | None
     std_floor: float
+    std_lasting: float = 0.0
     std_per_m: float = 0.0
 
 

@@ -169,13 +169,18 @@ def read_component(table: Table, what: str, find: Callable[[str], Any], named: C
         to_si(unit),
         std_from,
         table.number("std_floor", 0.0, low=0.0, high=_LARGEST),
+        table.number("std_lasting", 0.0, low=0.0, high=_LARGEST),
         table.number("std_per_m", 0.0, low=0.0, high=_LARGEST),
     )
     table.done()
     if component.std_floor and std_from is None:
         raise table.error("'std_floor' is of use only with a 'std_signal'")
-    if component.std_per_m and what != "y":
-        raise table.error("'std_per_m' is for y: an error of the bearing")
+    for key, value in (
+        ("std_lasting", component.std_lasting),
+        ("std_per_m", component.std_per_m),
+    ):
+        if value and what != "y":
+            raise table.error(f"'{key}' is for y: an error of the bearing")
     return component
 
 

@@ -141,8 +141,12 @@ class DemoRun:
         self.work = LatencyLog()
         self.on_scan: Callable[[], None] = lambda: None
         n = len(truths)
+        profile = load_profile("can_imm")
+        assert profile.header is not None
+        # without the ego's motion, of which the scenario says nothing
+        self.radar_ids = [m.frame_id for m in (profile.header.message, *profile.messages)]
         self.node = DetectorNode(
-            ScanDecoder(load_profile("can_imm"), n),
+            ScanDecoder(profile, n),
             Detector(load_bank(preset), capacity=n, seed=seed),
             ManoeuvreEncoder(),
             self.health,

@@ -169,7 +169,7 @@ class LiveView:
 
     def _bus(self) -> list[Text]:
         tap, decoded = self._show.tap, self._show.node.decoder.counts
-        radar = sorted(self._show.node.decoder.ids)
+        radar = self._show.radar_ids
         answers = sum(tap.counts[i] for i in OUTPUT_IDS)
         return [
             self._frames("radar", radar, f"{decoded.frames:,} frames, {decoded.rejected} rejected"),

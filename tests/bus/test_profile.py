@@ -180,22 +180,23 @@ OWN_Y = 'y = { signal = "DistLat", std = 0.2'
 @pytest.mark.parametrize(
     ("more", "expected"),
     [
-        # the rounding to steps of some centimetres is less than a hundredth of these
-        ("", {10.0: 0.2, 100.0: 0.2}),
-        (", std_per_m = 0.0", {10.0: 0.2, 100.0: 0.2}),
-        (", std_per_m = 0.015", {10.0: 0.25, 100.0: 1.513275}),
-        (', std_per_m = 0.015, unit = "cm"', {10.0: 0.0025, 100.0: 0.01513275}),
+        ("", {10.0: 0.0, 100.0: 0.0}),
+        (", std_per_m = 0.0", {10.0: 0.0, 100.0: 0.0}),
+        (", std_lasting = 0.3", {10.0: 0.3, 100.0: 0.3}),
+        (", std_per_m = 0.015", {10.0: 0.15, 100.0: 1.5}),
+        (", std_per_m = 0.015, std_lasting = 0.2", {10.0: 0.25, 100.0: 1.513275}),
+        (', std_per_m = 0.015, unit = "cm"', {10.0: 0.0015, 100.0: 0.015}),
     ],
 )
-def test_std_per_m_is_added_in_quadrature(tmp_path, radar, more, expected):
+def test_errors_that_last(tmp_path, radar, more, expected):
     decoder = ScanDecoder(profile_with(tmp_path, "can_imm", OWN_Y, OWN_Y + more))
     frames = [radar.scan(len(expected))]
     frames += [radar.object(k, DistLong=x, DistLat=-3.0) for k, x in enumerate(expected)]
     (scan,) = (found for frame in frames if (found := decoder.feed(Frame(0, *frame))))
     assert scan.z[: scan.n, 0].tolist() == pytest.approx(list(expected))
-    assert scan.std[: scan.n, 2].tolist() == pytest.approx(list(expected.values()), rel=0.01)
-    others = scan.std[: scan.n, [0, 1, 3]]
-    assert others == pytest.approx(np.tile([0.1, 0.3, 0.3], (scan.n, 1)), rel=0.05)
+    assert scan.lasting[: scan.n].tolist() == pytest.approx(list(expected.values()))
+    y = 0.002 if "cm" in more else 0.2
+    assert scan.std[: scan.n, :3] == pytest.approx(np.tile([0.1, 0.3, y], (scan.n, 1)), rel=0.05)
 
 
 def test_profiles_check_tells_of_std_per_m(tmp_path):
@@ -208,10 +209,12 @@ def test_profiles_check_tells_of_std_per_m(tmp_path):
         )
         return line
 
-    assert of_y(load_profile("toyota")).endswith("and rounding), and 0.012 per metre ahead")
+    assert of_y(load_profile("toyota")).endswith(
+        "; lasting errors of 0.57 and 0.012 per metre ahead"
+    )
     assert "per metre" not in of_y(load_profile("can_imm"))
     changed = profile_with(tmp_path, "can_imm", OWN_Y, OWN_Y + ", std_per_m = 0.02")
-    assert "(0.2 and rounding), and 0.02 per metre ahead" in of_y(changed)
+    assert "(0.2 and rounding); lasting errors of 0 and 0.02 per metre ahead" in of_y(changed)
 
 
 @pytest.mark.parametrize("name", ["ars999", "", "none.toml", "sub/none"])
