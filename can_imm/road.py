@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from can_imm.estimation import road
+from can_imm.estimation import guides, road
 from can_imm.reporting import doubt_, globalise_
 from can_imm.types import FloatArray, Scan
 
@@ -85,12 +85,12 @@ class RoadFrame:
     def watch_(
         self, bank: ModeBank, objects: Any, scan: Scan, slot: Any, status: Any, age: Any
     ) -> int:
-        """Update the road by the traffic; see `estimation.road.watch_traffic_`."""
+        """Update the road by the traffic; see `estimation.guides.watch_traffic_`."""
         with np.errstate(over="ignore"):  # a row that is not used may say anything
             r = np.square(scan.std)
             r[:, 2] += np.square(scan.lasting)
         return int(
-            road.watch_traffic_(
+            guides.watch_traffic_(
                 self.x, self.P, self._par, self._guide_slot, self._guide_unseen, self._unrest,
                 bank.record, objects, scan.n, slot, status, age,
                 scan.z, r, scan.valid, scan.angle, self._dt,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from can_imm.estimation import layout, road
+from can_imm.estimation import guides, layout, road
 from can_imm.types import FloatArray
 
 KEEP, LEFT, STILL = 0, 1, 2
@@ -83,7 +83,7 @@ class Traffic:
         for s in slots:
             self.age[s] += 1
         return int(
-            road.watch_traffic_(
+            guides.watch_traffic_(
                 self.x, self.P, self.par, self.guide_slot, self.guide_unseen, np.ones(1),
                 self.bank, self.objects, n, np.array(slots, np.int32),
                 np.full(n, status, np.int8), self.age, z, np.full((n, 4), std**2),

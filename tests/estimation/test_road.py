@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from oracles.gaussian import random_covariance, update
 from small_roads import KEEP, LEFT, STILL, Traffic, nothing_but_motion, parameters
 
-from can_imm.estimation import road
+from can_imm.estimation import guides, road
 from can_imm.estimation.road import (
     BIAS,
     CHANGE,
@@ -246,7 +246,7 @@ def test_a_guide_begins_as_uncertain_as_its_measurement_and_the_road(seed: int, 
     """As the augmented state: place = y - lane, y measured with variance r."""
     rng = np.random.default_rng(seed)
     x, P = rng.normal(size=N), random_covariance(rng, N)
-    road.free_guide_(P, x, g)
+    guides.free_guide_(P, x, g)
     h = np.zeros(N_ROAD + 1)
     road.lane_row_(h, 40.0)
     y, r, a = 3.1, 0.2, N_ROAD + g
@@ -257,7 +257,7 @@ def test_a_guide_begins_as_uncertain_as_its_measurement_and_the_road(seed: int, 
     expected_P[a, a] += r
     expected_x = G @ x
     expected_x[a] += y
-    road.begin_guide_(x, P, h, g, y, r)
+    guides.begin_guide_(x, P, h, g, y, r)
     np.testing.assert_allclose(x, expected_x, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(P, expected_P, rtol=1e-9, atol=1e-9)
     # it agrees with the measurement it comes from
@@ -269,7 +269,7 @@ def test_a_guide_is_forgotten() -> None:
     rng = np.random.default_rng(3)
     x, P = rng.normal(size=N), random_covariance(rng, N)
     before = P.copy()
-    road.free_guide_(P, x, 5)
+    guides.free_guide_(P, x, 5)
     a = N_ROAD + 5
     assert x[a] == 0.0
     assert not P[a].any()
@@ -332,7 +332,7 @@ def test_the_covariance_follows_when_the_lanes_are_counted_anew() -> None:
     traffic.P[:] = 0.01 * random_covariance(rng, N)
     traffic.x[OFFSET] = 2.0
     x, P = traffic.x.copy(), traffic.P.copy()
-    moved = road.watch_traffic_(
+    moved = guides.watch_traffic_(
         traffic.x, traffic.P, traffic.par, traffic.guide_slot, traffic.guide_unseen, np.ones(1),
         traffic.bank, traffic.objects, 0, np.zeros(0, np.int32), np.zeros(0, np.int8),
         traffic.age, np.zeros((0, 4)), np.zeros((0, 4)), np.zeros((0, 4), np.bool_),
@@ -388,7 +388,7 @@ def test_who_guides() -> None:
     """From the second scan on which it is seen, ahead, near, and neither oncoming nor standing."""
     traffic = Traffic(parameters())
     traffic.objects["mu"][3, [KEEP, STILL]] = 0.1, 0.9
-    xy = [[40.0, 0.0], [road.SEEN_TO + 5.0, 0.0], [-5.0, 3.5], [40.0, 7.0]]
+    xy = [[40.0, 0.0], [guides.SEEN_TO + 5.0, 0.0], [-5.0, 3.5], [40.0, 7.0]]
     traffic.scan(range(4), xy)
     assert traffic.guide_slot[0] == 0
     assert (traffic.guide_slot[1:] == FREE).all()
