@@ -86,7 +86,7 @@ class History(Protocol):
             ids: (capacity,) object id of each slot, -1 for a free one.
             measured: (capacity,) the slot was updated by this scan.
             reports: (n,) of the slots in use, in their order, in the road's axes and unrelated.
-            road: (7,) state of `estimation.road`, None without a road.
+            road: (31,) state of `estimation.road`, None without a road.
             moved: lanes that the ego has moved to the left since the last scan.
             ego_speed: [m/s], NaN where unknown.
         """

@@ -98,7 +98,7 @@ class _Smoother:
         # for the relations between the reports of a scan
         self._ids: IntArray = np.zeros(0, np.int32)
         self._memory = np.zeros(0, MEMORY_DTYPE)
-        self._h: FloatArray = np.zeros(N_ROAD)
+        self._h: FloatArray = np.zeros(N_ROAD + 1)
         rows = self._take_rows()
         self._smooth = entry_point(smooth_, *self._smooth_arguments(rows, 0))
         arguments = self._conclude_arguments(rows, 0, 0, rows.said)

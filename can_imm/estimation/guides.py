@@ -79,6 +79,17 @@ def add_width_(P: FloatArray, a: int, times: float) -> None:  # pragma: no cover
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def position(
+    z: FloatArray, r: FloatArray, angle: float
+) -> tuple[float, float, float]:  # pragma: no cover - compiled
+    """x and y in the vehicle's axes [m], and the variance of y, of a row (4,) of a scan."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    x = z[0] * cos - z[2] * sin
+    y = z[0] * sin + z[2] * cos
+    return x, y, r[2] * cos * cos + r[0] * sin * sin
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def follow_bend_(
     road: FloatArray,
     P: FloatArray,
@@ -111,12 +122,10 @@ def follow_bend_(
         g = guide_of[s]
         if g == FREE:
             continue
-        cos, sin = math.cos(angle[k]), math.sin(angle[k])
-        x = z[k, 0] * cos - z[k, 2] * sin
-        y = z[k, 0] * sin + z[k, 2] * cos
+        x, y, noise = position(z[k], r[k], angle[k])
         a = N_ROAD + g
         lane_row_(h, x)
-        v = variance(P, h) + P[a, a] + r[k, 2] * cos * cos + r[k, 0] * sin * sin
+        v = variance(P, h) + P[a, a] + noise
         for i in range(N_ROAD):
             v += 2.0 * h[i] * P[i, a]
         if v > 0.0:
@@ -185,10 +194,7 @@ def watch_traffic_(
         s = slot[k]
         if s < 0 or status[k] != 0 or not (valid[k, 0] and valid[k, 2]):
             continue
-        cos, sin = math.cos(angle[k]), math.sin(angle[k])
-        x = z[k, 0] * cos - z[k, 2] * sin
-        y = z[k, 0] * sin + z[k, 2] * cos
-        noise = r[k, 2] * cos * cos + r[k, 0] * sin * sin
+        x, y, noise = position(z[k], r[k], angle[k])
         moving = 0.0
         off = 0.0
         for j in range(bank[0].n_modes):
