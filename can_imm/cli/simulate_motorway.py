@@ -15,14 +15,12 @@ from can_imm.bus.radar_encoder import ProfileEncoder
 from can_imm.cli.reports import DIRECTION, STATES, seconds
 from can_imm.runtime.loop import STEP_NS
 from can_imm.sim.motorway import MotorwayTruth, drive, motorway_settings, random_motorway
-from can_imm.sim.radar import measure_ego, observe, radar_model
+from can_imm.sim.radar import ego_messages, observe, radar_model
 from can_imm.types import CUT_IN, CUT_OUT, OVERTAKING_ANOTHER, Manoeuvre, Scan
 
 if TYPE_CHECKING:
     from can_imm.bus.profile_parts import Profile
 
-EGO_PERIOD_NS = 20_000_000
-"""The vehicle tells its own motion so often [ns]."""
 EVENTS = {CUT_IN: "CUT_IN", CUT_OUT: "CUT_OUT", OVERTAKING_ANOTHER: "OVERTAKING"}
 
 
@@ -91,11 +89,7 @@ def play_motorway(
         radar = replace(radar, dropout=dropout)
     truth = drive(random_motorway(rng, motorway_settings(settings)))
     scans = {scan.t_ns: scan for scan in observe(truth, radar, rng).scans}
-    times = np.arange(0, int(truth.t_ns[-1]) + 1, EGO_PERIOD_NS, dtype=np.int64)
-    speed, yaw_rate = measure_ego(truth, times, rng)
-    ego = dict(
-        zip(times.tolist(), zip(speed.tolist(), yaw_rate.tolist(), strict=True), strict=True)
-    )
+    ego = {t: (speed, yaw_rate) for t, speed, yaw_rate in ego_messages(truth, rng)}
     moments = [Moment(t, ego.get(t), scans.get(t)) for t in sorted({*ego, *scans})]
     return MotorwayRun(moments, MotorwayEncoder(profile), truth, len(scans))
 

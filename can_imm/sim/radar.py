@@ -20,6 +20,8 @@ MS = 1_000_000
 """[ns]"""
 _NEAREST = 1.0
 """What is nearer along x is not seen [m]."""
+EGO_PERIOD_NS = 20_000_000
+"""The vehicle tells its own motion so often [ns]."""
 _EGO_SPEED_STD, _EGO_YAW_STD, _EGO_YAW_BIAS = 0.05, 0.002, 0.003
 """Errors of the measured ego motion [m/s, rad/s, rad/s]."""
 
@@ -177,6 +179,13 @@ def measure_ego(
         np.interp(times, t, ego.speed) + noise * _EGO_SPEED_STD * speed,
         np.interp(times, t, ego.yaw_rate) + noise * (bias + _EGO_YAW_STD * yaw_rate),
     )
+
+
+def ego_messages(truth: MotorwayTruth, rng: np.random.Generator) -> list[tuple[int, float, float]]:
+    """Time [ns], speed [m/s] and yaw rate [rad/s] of what the ego says of itself in a drive."""
+    times = np.arange(0, int(truth.t_ns[-1]) + 1, EGO_PERIOD_NS, dtype=np.int64)
+    speed, yaw_rate = measure_ego(truth, times, rng)
+    return list(zip(times.tolist(), speed.tolist(), yaw_rate.tolist(), strict=True))
 
 
 class _Observer:

@@ -20,14 +20,12 @@ from can_imm.sim.motorway import (
     drive,
     random_motorway,
 )
-from can_imm.sim.radar import Measured, measure_ego, observe, radar_model
+from can_imm.sim.radar import Measured, ego_messages, observe, radar_model
 from can_imm.studies.runs import Int8Array, Int64Array
 from can_imm.types import BoolArray, FloatArray, Manoeuvre, Scan
 
 CAPACITY = 128
 """Objects in a scan."""
-EGO_PERIOD_NS = 20_000_000
-"""The vehicle tells its own motion so often [ns]."""
 
 TRAFFIC = (
     Manoeuvre.KEEP_LANE,
@@ -82,10 +80,7 @@ def play_motorway(profile: str, seed: int, settings: MotorwaySettings) -> Motorw
     radar = replace(radar_model(spoken.name), tick=STEP_NS * 1e-9)
     truth = drive(random_motorway(rng, settings))
     measured = observe(truth, radar, rng)
-    ego_t = np.arange(0, int(truth.t_ns[-1]) + 1, EGO_PERIOD_NS, dtype=np.int64)
-    ego = list(
-        zip(ego_t.tolist(), *(a.tolist() for a in measure_ego(truth, ego_t, rng)), strict=True)
-    )
+    ego = ego_messages(truth, rng)
     encoder, decoder = ProfileEncoder(spoken), ScanDecoder(spoken, CAPACITY)
     collected = _Rows(truth)
     said = 0

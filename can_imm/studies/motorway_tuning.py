@@ -8,7 +8,7 @@ starts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from can_imm.sim.motorway import TUNING, MotorwaySettings, plain
+from can_imm.studies.descent import descend
 from can_imm.studies.motorway_filter import Frames, curvature_of, follow, frames_of, level
 from can_imm.studies.motorway_rules import START, Rules, judge, rules_for
 from can_imm.studies.motorway_runs import TRAFFIC, play_motorway
@@ -88,30 +89,6 @@ class Objective:
         return float(np.mean(wrong[seen] / self._frames[seen]))
 
 
-def _neighbours(rules: Rules, name: str, step: float) -> Iterator[Rules]:
-    now = getattr(rules, name)
-    for value in _CHOICES.get(name, (now * (1.0 + step), now / (1.0 + step))):
-        if value != now:
-            yield rules._replace(**{name: value})
-
-
-def descend(objective: Callable[[Rules], float], rules: Rules) -> tuple[float, Rules]:
-    """One constant at a time, until no step of any size helps."""
-    best = objective(rules)
-    for step in _STEPS:
-        moved = True
-        while moved:
-            moved = False
-            for name in Rules._fields:
-                if name in _FIXED:
-                    continue
-                for candidate in _neighbours(rules, name, step):
-                    error = objective(candidate)
-                    if error < best - 1e-5:
-                        best, rules, moved = error, candidate, True
-    return best, rules
-
-
 def _scattered(rules: Rules, rng: np.random.Generator) -> Rules:
     values: dict[str, Any] = {
         name: value * float(np.exp(_SPREAD * rng.standard_normal()))
@@ -158,7 +135,9 @@ def tune(
     in_use = rules_for(profile, plain=straight)
     for start in range(starts):
         begin = in_use if start == 0 else _scattered(START, rng)
-        error, rules = descend(objective, begin)
+        error, rules = descend(
+            objective, begin, steps=_STEPS, choices=_CHOICES, fixed=_FIXED, least=1e-5
+        )
         if error < best:
             best, found = error, rules
         progress(best)

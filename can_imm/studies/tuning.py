@@ -8,7 +8,7 @@ the same way over the four states.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from can_imm.studies import descent
 from can_imm.studies.baselines import (
     RULES,
     Noise,
@@ -132,27 +133,9 @@ class Objective:
         return sum(WEIGHTS[truth] * v for truth, v in self.per_truth(rules).items())
 
 
-def _neighbours(rules: Rules, name: str, step: float) -> Iterator[Rules]:
-    now = getattr(rules, name)
-    values: Sequence[Any] = _CHOICES.get(name, (now * (1 + step), now / (1 + step)))
-    for value in values:
-        if value != now:
-            yield rules._replace(**{name: value})
-
-
 def descend(objective: Callable[[Rules], float], rules: Rules) -> tuple[float, Rules]:
     """One threshold at a time, until no step of any size helps."""
-    best = objective(rules)
-    for step in _STEPS:
-        moved = True
-        while moved:
-            moved = False
-            for name in Rules._fields:
-                for candidate in _neighbours(rules, name, step):
-                    error = objective(candidate)
-                    if error < best - 1e-6:
-                        best, rules, moved = error, candidate, True
-    return best, rules
+    return descent.descend(objective, rules, steps=_STEPS, choices=_CHOICES)
 
 
 def tune_rules(
