@@ -14,7 +14,7 @@ from can_imm.estimation.noise import noise_state
 from can_imm.estimation.particles import N_COLUMNS, N_SCRATCH
 from can_imm.estimation.tracks import TALLY, assign_, bury_, settle_, straighten_
 from can_imm.manoeuvres import ModeBank
-from can_imm.relations import MEMORY_DTYPE, relate_, shift_lanes_
+from can_imm.relations import MEMORY_DTYPE, hesitate_, relate_, shift_lanes_
 from can_imm.reporting import extrapolate_all_, fill_reports_
 from can_imm.road import RoadFrame
 from can_imm.types import REPORT_DTYPE, BoolArray, CanImmError, FloatArray, IntArray, Scan
@@ -203,6 +203,7 @@ class Detector:
         """Compile, or load from the cache, every kernel that `step` and `predict` call."""
         scan = Scan(1)
         self._grow_rows(self.capacity)
+        hesitate_(self._id, self._memory, 0.5, self.reports, 0)
         relate_(self._id, self._memory, self.reports, 0)
         shift_lanes_(self._memory, 0)
         self._processor.run(self._processor.address, 0, 0.0, 0.0, 0.0)
@@ -406,7 +407,8 @@ class Detector:
                 None if self._road is None else self._road.x, moved, self._ego_speed,
             )  # fmt: skip
         if self._road is not None:
-            self._road.doubt_(self.reports, n)
+            self._road.doubt_(self._id, self._memory, self.reports)
+            hesitate_(self._id, self._memory, self._road.sure, self.reports, n)
             relate_(self._id, self._memory, self.reports, n)
             self._road.globalise_(self.reports, n)
         return n

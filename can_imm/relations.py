@@ -14,16 +14,19 @@ NO_LANE = -128
 MEMORY_DTYPE = np.dtype(
     [
         ("left_ns", np.int64),
+        ("trust", np.float64),
         ("twin", np.int32),
         ("twin_scans", np.int32),
         ("kept", np.int16),
         ("left", np.int16),
+        ("changing", np.bool_),
     ],
     align=True,
 )
-"""What is remembered of a slot: ``kept`` the lane it kept last, ``left`` the lane that it left to
-the left at ``left_ns`` (lanes by their number, `NO_LANE` for none); ``twin`` slot of an object that
-has been in the same place for ``twin_scans`` scans."""
+"""What is remembered of a slot: ``changing`` a lane change was said of it, ``trust`` how far it was
+trusted (`reporting.doubt_`); ``kept`` the lane it kept last, ``left`` the lane that it left to the
+left at ``left_ns`` (lanes by number, `NO_LANE` for none); ``twin`` slot of an object that has been
+in the same place for ``twin_scans`` scans."""
 
 OVERTAKING_NS = 20_000_000_000
 """So long after a lane change to the left [ns] passing the other lane's vehicles is overtaking."""
@@ -36,6 +39,35 @@ TWIN_SCANS = 3
 _LANE_CHANGE = int(Manoeuvre.LANE_CHANGE)
 _STATIONARY = int(Manoeuvre.STATIONARY)
 _ONCOMING = int(Manoeuvre.ONCOMING)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def hesitate_(
+    ids: Any, memory: Any, sure: float, reports: Any, n: int
+) -> None:  # pragma: no cover - compiled
+    """Say that a lane change has begun only when that is sure, in place.
+
+    Most of what is a lane change by a narrow margin is a vehicle that wanders in its lane, and soon
+    goes back.  Until it is ``sure`` the second most probable manoeuvre is said; a lane change that
+    was said stays until another manoeuvre is more probable.  Other arguments as for `relate_`.
+    """
+    k = 0
+    for s in range(ids.shape[0]):
+        if ids[s] < 0:
+            continue
+        report = reports[k]
+        k += 1
+        if report.age <= 1:
+            memory[s].changing = False
+        changing = report.manoeuvre == _LANE_CHANGE
+        if changing and not memory[s].changing and report.probability < sure:
+            changing = False
+            p = report.probability
+            report.manoeuvre, report.second = report.second, report.manoeuvre
+            report.probability = report.second_probability
+            report.second_probability = p
+            report.direction = 0
+        memory[s].changing = changing
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -10,7 +10,7 @@ import numpy as np
 
 from can_imm.estimation.constraints import normal_mass
 from can_imm.estimation.imm import extrapolate_
-from can_imm.estimation.road import lane_row_, place, variance
+from can_imm.estimation.road import WAY, place, slope_row_, variance
 from can_imm.types import FloatArray, Manoeuvre
 
 _LANE_CHANGE = int(Manoeuvre.LANE_CHANGE)
@@ -21,6 +21,13 @@ _KEEP_LANE = int(Manoeuvre.KEEP_LANE)
 
 STEADY = 0.6
 """Up to this relative speed [m/s] an object is about as fast as the ego."""
+
+
+OVER = 0.2
+"""A lane change that is less probable is over."""
+
+WANDER_SPEED = 0.1
+"""Lateral speed of vehicles that keep their lane [m/s]."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -155,7 +162,7 @@ def globalise_(road: FloatArray, h: FloatArray, reports: Any, n: int, speed: flo
     """States of the first n reports from the road's axes into the sensor's, in place.
 
     Args:
-        road: (31,) state of `estimation.road`.  h: (8,) scratch.
+        road: (N,) state of `estimation.road`.  h: (N_ROAD,) scratch.
         speed: of the ego [m/s], NaN where unknown.
     """
     for k in range(n):
@@ -167,23 +174,49 @@ def globalise_(road: FloatArray, h: FloatArray, reports: Any, n: int, speed: flo
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def doubt_(P: FloatArray, doubtful: float, h: FloatArray, reports: Any, n: int) -> None:
-    """Trust lane changes of the first n reports no further than the road is known, in place.
+def doubt_(
+    road: FloatArray,
+    P: FloatArray,
+    doubtful: float,
+    speed: float,
+    h: FloatArray,
+    ids: Any,
+    memory: Any,
+    reports: Any,
+) -> None:
+    """Trust lane changes no further than the road is known, in place.
 
-    Where the road ahead is known to s metres, what looks like a lane change is one with a share of
-    1 / (1 + (s / doubtful)^4); the rest goes to what its speed makes of the object.
+    A vehicle that keeps its lane where the road bends unseen moves across the lane where the road
+    is expected: with a lateral speed that is normal, of the uncertainty of the road's direction
+    times the vehicle's speed.  By how much likelier than that a lane change makes the lateral
+    speed, so much of its probability stays; the rest goes to what its speed makes of the object.
+    The trust stays until the lane change is over, however slowly it ends.
 
     Args:
-        P: (31, 31) covariance of `estimation.road`.  h: (8,) scratch.
-        doubtful: [m].
+        road, P: (N_ROAD,), (N_ROAD, N_ROAD) state and covariance of `estimation.road`.
+        doubtful: how much likelier lanes are kept than changed, times the spread of the lateral
+            speeds of lane changes [m/s].
+        speed: of the ego [m/s].
+        h: (N_ROAD,) scratch.
+        ids: (capacity,) object id of each slot, -1 for a free one.
+        memory: (capacity,) of `relations.MEMORY_DTYPE`.
     """
-    for k in range(n):
+    k = -1
+    for s in range(ids.shape[0]):
+        if ids[s] < 0:
+            continue
+        k += 1
         report = reports[k]
         p = report.p[_LANE_CHANGE]
+        if report.age <= 1 or p < OVER:
+            memory[s].trust = 0.0
         if p < 0.01:
             continue
-        lane_row_(h, report.x[0])
-        share = 1.0 / (1.0 + (variance(P, h) / doubtful**2) ** 2)
+        slope_row_(h, road[WAY], report.x[0])
+        s2 = WANDER_SPEED**2 + variance(P, h) * (speed + report.x[1]) ** 2
+        kept = doubtful * math.exp(-0.5 * report.x[3] ** 2 / s2) / math.sqrt(s2)
+        share = max(1.0 / (1.0 + kept), memory[s].trust)
+        memory[s].trust = share
         other = _KEEP_LANE
         if abs(report.x[1]) > STEADY:
             other = _RECEDING if report.x[1] > 0.0 else _APPROACHING

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from can_imm.estimation import guides, road
+from can_imm.relations import MEMORY_DTYPE
 from can_imm.reporting import doubt_, globalise_
-from can_imm.types import FloatArray, Scan
+from can_imm.types import REPORT_DTYPE, VY, FloatArray, IntArray, Scan
 
 if TYPE_CHECKING:
     from can_imm.manoeuvres import ModeBank
+
+SCANS = 64
+"""So many scans at most wait to be learnt from."""
+
+SHORTEST_S = 0.001
+"""[s]; the first scan after a silence has no time before it."""
 
 LONGEST_S = 1.0
 """After a longer silence [s] the ego has moved on unseen: the road is a new one."""
@@ -28,17 +36,21 @@ class RoadFrame:
         par: `estimation.road.PARAMETERS`.
 
     Attributes:
-        x, P: (31,), (31, 31) state and covariance of the filter.
+        x, P: (N_ROAD,), (N_ROAD, N_ROAD) state and covariance of the filter at the last scan,
+            without the guides.
     """
 
     def __init__(self, par: FloatArray) -> None:
         self._par = par
         self._guide_slot = np.full(road.N_GUIDES, road.FREE, np.int32)
         self._guide_unseen = np.zeros(road.N_GUIDES)
-        self._unrest = np.ones(1)
-        self.x, self.P = road.new_road(par)
+        self._notes: np.ndarray[Any, np.dtype[np.void]] = np.zeros((SCANS, 0), guides.NOTE_DTYPE)
+        # the filter as of the last scan that was learnt from; the ego's motion of those since
+        self._past, self._P_past = road.new_road(par)
+        self._motion: deque[tuple[float, float, float]] = deque()
+        self._first = 0
+        self.x, self.P = self._past[: road.N_ROAD].copy(), self._without_guides()
         self._t_ns = -1
-        self._dt = 0.1
         self._speed = math.nan
         self._h = np.zeros(road.N_ROAD + 1)
         self._warm_up()
@@ -48,14 +60,26 @@ class RoadFrame:
         """Of the lanes [m]."""
         return float(self.x[road.WIDTH])
 
+    @property
+    def sure(self) -> float:
+        """How probable a lane change must be to be said; see `relations.hesitate_`."""
+        return float(self._par[road.P_SURE])
+
+    def _without_guides(self) -> FloatArray:
+        return self._P_past[: road.N_ROAD, : road.N_ROAD].copy()
+
     def _warm_up(self) -> None:
         """Compile, or load from the cache."""
-        x, P = self.x.copy(), self.P.copy()
         scan = Scan(1)
-        road.predict_road_(x, P, self._par, 0.1, 20.0, 0.0)
+        for x, P in ((self.x.copy(), self.P.copy()), (self._past.copy(), self._P_past.copy())):
+            road.predict_road_(x, P, self._par, 0.1, 20.0, 0.0)
+            guides.change_lane_(x, P, self._guide_slot, 0, self.width)
         road.localise_(x, P, self._par, 0, scan.z, scan.std, scan.valid, scan.angle, 20.0)
         road.turn_with_road_(x, P, self._par, 20.0, 0.0, 1.0)
         road.place(x, self._h, 0.0, 0.0, 20.0)
+        nobody = np.zeros(0, np.int32)
+        reports, memory = np.zeros(1, REPORT_DTYPE), np.zeros(0, MEMORY_DTYPE)
+        doubt_(x, P, 1.0, 20.0, self._h, nobody, memory, reports)
 
     def move(self, t_ns: int, speed: float, yaw_rate: float) -> None:
         """Move the ego on to the time of the next scan.
@@ -66,16 +90,23 @@ class RoadFrame:
         """
         dt = (t_ns - self._t_ns) * 1e-9
         if self._t_ns < 0 or dt > LONGEST_S:
-            width, var = self.x[road.WIDTH], self.P[road.WIDTH, road.WIDTH]
-            self.x, self.P = road.new_road(self._par)
-            self.x[road.WIDTH], self.P[road.WIDTH, road.WIDTH] = width, var
+            width, var = self._past[road.WIDTH], self._P_past[road.WIDTH, road.WIDTH]
+            self._past, self._P_past = road.new_road(self._par)
+            self._past[road.WIDTH], self._P_past[road.WIDTH, road.WIDTH] = width, var
             self._guide_slot[:] = road.FREE
-            road.turn_with_road_(self.x, self.P, self._par, speed, yaw_rate, 1.0)
-        else:
-            self._dt = dt
-            road.predict_road_(self.x, self.P, self._par, dt, speed, yaw_rate)
+            self._motion.clear()
+            road.turn_with_road_(self._past, self._P_past, self._par, speed, yaw_rate, 1.0)
+            dt = 0.0
+        self._motion.append((dt, speed, yaw_rate))
+        self.x, self.P = self._past[: road.N_ROAD].copy(), self._without_guides()
+        for passed in self._motion:
+            self._pass(self.x, self.P, *passed)
         self._t_ns = t_ns
         self._speed = speed
+
+    def _pass(self, x: FloatArray, P: FloatArray, dt: float, speed: float, yaw_rate: float) -> None:
+        if dt > 0.0:
+            road.predict_road_(x, P, self._par, dt, speed, yaw_rate)
 
     def localise_(self, scan: Scan, z: FloatArray, r: FloatArray) -> None:
         """Measurements z, r (N, 4) of the scan into the road's axes, in place."""
@@ -85,26 +116,66 @@ class RoadFrame:
     def watch_(
         self, bank: ModeBank, objects: Any, scan: Scan, slot: Any, status: Any, age: Any
     ) -> int:
-        """Update the road by the traffic; see `estimation.guides.watch_traffic_`."""
+        """Learn of the road by the traffic; see `estimation.guides`.
+
+        Returns:
+            By how many lanes the ego has moved to the left (+1, -1 or 0).  The road's offset and
+            the objects' lateral positions have been changed accordingly.
+        """
+        if self._notes.shape[1] != len(objects):
+            self._notes = np.zeros((SCANS, len(objects)), guides.NOTE_DTYPE)
         with np.errstate(over="ignore"):  # a row that is not used may say anything
             r = np.square(scan.std)
             r[:, 2] += np.square(scan.lasting)
-        return int(
-            guides.watch_traffic_(
-                self.x, self.P, self._par, self._guide_slot, self._guide_unseen, self._unrest,
-                bank.record, objects, scan.n, slot, status, age,
-                scan.z, r, scan.valid, scan.angle, self._dt,
-            )
+        last = (self._first + len(self._motion) - 1) % SCANS
+        guides.note_(
+            self._notes[last], bank.record, objects, scan.n, slot, status, age,
+            scan.z, r, scan.valid, scan.angle,
         )  # fmt: skip
+        self._learn(bool(scan.valid[: scan.n, VY].any()))
+        moved = 0
+        if abs(self.x[road.OFFSET]) > 0.5 * self.width:
+            moved = 1 if self.x[road.OFFSET] > 0.0 else -1
+            width = self.width
+            guides.change_lane_(self.x, self.P, self._guide_slot, moved, width)
+            guides.change_lane_(self._past, self._P_past, self._guide_slot, moved, width)
+            guides.shift_objects_(bank.record, objects, moved * width)
+        return moved
 
-    def doubt_(self, reports: np.ndarray[Any, np.dtype[np.void]], n: int) -> None:
+    def _learn(self, soon: bool) -> None:
+        """From the scans that lie far enough back; from all if waiting is of no use.
+
+        Without the ego's motion it is not known where it has gone meanwhile.
+
+        Args:
+            soon: lane changes are recognised soon, for the radar measures lateral speeds.
+        """
+        speed, yaw_rate = self._motion[-1][1:]
+        known = not (math.isnan(speed) or math.isnan(yaw_rate))
+        wait = self._par[road.P_HINDSIGHT] if soon and known else -math.inf
+        since = sum(dt for dt, _, _ in self._motion) - self._motion[0][0]
+        while self._motion and (since >= wait or len(self._motion) == SCANS):
+            motion = self._motion.popleft()
+            self._pass(self._past, self._P_past, *motion)
+            guides.learn_(
+                self._past, self._P_past, self._par, self._guide_slot, self._guide_unseen,
+                self._notes, self._first, len(self._motion), max(motion[0], SHORTEST_S),
+            )  # fmt: skip
+            self._first = (self._first + 1) % SCANS
+            if self._motion:
+                since -= self._motion[0][0]
+        if not self._motion:
+            self.x, self.P = self._past[: road.N_ROAD].copy(), self._without_guides()
+
+    def doubt_(self, ids: IntArray, memory: Any, reports: np.ndarray[Any, Any]) -> None:
         """Trust lane changes no further than the road is known; see `reporting.doubt_`.
 
         Without the ego's motion nothing is known of the road, and it is taken to be straight.
         """
         if math.isnan(self._speed):
             return
-        doubt_(self.P, self._par[road.P_DOUBTFUL], self._h, reports, n)
+        doubtful = self._par[road.P_DOUBTFUL]
+        doubt_(self.x, self.P, doubtful, self._speed, self._h, ids, memory, reports)
 
     def globalise_(self, reports: np.ndarray[Any, np.dtype[np.void]], n: int) -> None:
         """The first n reports from the road's axes into the sensor's, in place."""

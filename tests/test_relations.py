@@ -12,6 +12,7 @@ from can_imm.relations import (
     NO_LANE,
     OVERTAKING_NS,
     TWIN_SCANS,
+    hesitate_,
     relate_,
     shift_lanes_,
 )
@@ -57,6 +58,35 @@ def at(lane: int, x: float = 40.0, vx: float = 0.0, y: float = 0.0, **what: Any)
 
 def changing(direction: int, lane: int, **what: Any) -> dict[str, Any]:
     return at(lane, manoeuvre=CHANGE, direction=direction, **what)
+
+
+# ---- when a lane change is said
+
+
+def test_a_lane_change_is_said_when_it_is_sure_and_until_it_is_over() -> None:
+    memory, ids = np.zeros(3, MEMORY_DTYPE), np.array([-1, 4, 5], np.int32)
+
+    def said(p: float, age: int = 9) -> tuple[int, int, int]:
+        reports = np.zeros(2, REPORT_DTYPE)
+        reports["age"], reports["direction"] = age, -1
+        best, second = (CHANGE, KEEP) if p >= 0.5 else (KEEP, CHANGE)
+        reports["manoeuvre"], reports["second"] = best, second
+        reports["probability"], reports["second_probability"] = max(p, 1 - p), min(p, 1 - p)
+        reports[0]["manoeuvre"], reports[0]["second"] = KEEP, Manoeuvre.RECEDING
+        hesitate_(ids, memory, 0.7, reports, 2)
+        assert reports[0]["manoeuvre"] == KEEP
+        one = reports[1]
+        assert one["probability"] == pytest.approx(p if one["manoeuvre"] == CHANGE else 1 - p)
+        assert one["second_probability"] == pytest.approx(1 - one["probability"])
+        return one["manoeuvre"], one["second"], one["direction"]
+
+    assert said(0.6) == (KEEP, CHANGE, 0), "not yet"
+    assert said(0.71) == (CHANGE, KEEP, -1)
+    assert said(0.51) == (CHANGE, KEEP, -1), "still"
+    assert said(0.49)[0] == KEEP
+    assert said(0.6)[0] == KEEP, "that would be another one"
+    assert said(0.9)[0] == CHANGE
+    assert said(0.6, age=1)[0] == KEEP, "another object in this slot"
 
 
 # ---- lanes

@@ -1,4 +1,10 @@
-"""The vehicles that show where the road is: what all of them do at once, it has done or the ego."""
+"""The vehicles that show where the road is: what all of them do at once, it has done or the ego.
+
+A vehicle that begins to change lanes looks like a road that begins to bend, until more is known.
+So the road is learnt from the vehicles with hindsight: from each scan only some time later, when it
+is known which of them were changing lanes.  The road stands still meanwhile, and the ego's own
+motion is known.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +15,15 @@ import numba
 import numpy as np
 
 from can_imm.estimation.road import (
-    CHANGE,
-    CURVATURE,
     FREE,
     N_GUIDES,
     N_ROAD,
     OFFSET,
     P_FREEDOM,
     P_FREEDOM_CHANGING,
-    P_UNREST_CHANGE,
-    P_UNREST_CURVATURE,
     P_WANDER_STD,
     P_WANDER_TIME,
+    WAY,
     WIDTH,
     N,
     lane_row_,
@@ -30,14 +33,26 @@ from can_imm.estimation.road import (
 )
 from can_imm.types import FloatArray, IntArray
 
-SEEN_TO = 150.0
+SEEN_TO = 200.0
 """Vehicles further away [m] do not guide."""
 
 LANE_KNOWN = 0.2
 """Share of the lane's width: a guide whose place is less sure does not tell where the lanes are."""
 
-UNREST_TIME = 1.0
-"""[s], see `follow_bend_`."""
+NOTE_DTYPE = np.dtype(
+    [
+        ("x", np.float64),
+        ("y", np.float64),
+        ("noise", np.float64),
+        ("changing", np.float64),
+        ("off", np.float64),
+        ("seen", np.bool_),
+        ("new", np.bool_),
+    ],
+    align=True,
+)
+"""What a scan said of a slot's object: where it was measured in the vehicle's axes [m] and the
+variance of y [m²], and how probable it is that it changes lanes, and that it is off the lanes."""
 
 GATE = 16.0
 """Squared normalised innovation above which a guide is not where it was."""
@@ -72,9 +87,9 @@ def begin_guide_(
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def add_width_(P: FloatArray, a: int, times: float) -> None:  # pragma: no cover - compiled
     """What becomes of the covariance when so many widths are added to state a."""
-    for i in range(N):
+    for i in range(P.shape[0]):
         P[a, i] += times * P[WIDTH, i]
-    for i in range(N):
+    for i in range(P.shape[0]):
         P[i, a] += times * P[i, WIDTH]
 
 
@@ -90,64 +105,8 @@ def position(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def follow_bend_(
-    road: FloatArray,
-    P: FloatArray,
-    par: FloatArray,
-    guide_of: Any,
-    unrest: FloatArray,
-    n: int,
-    slot: Any,
-    status: Any,
-    age: Any,
-    z: FloatArray,
-    r: FloatArray,
-    valid: Any,
-    angle: FloatArray,
-    dt: float,
-) -> None:  # pragma: no cover - compiled
-    """Let the road bend faster while the guides are off to the same side, in place.
-
-    A road bends rarely, and then more than a stiff filter expects.  ``unrest`` (1,) is the squared
-    sum of the guides' normalised innovations over their number, a mean over `UNREST_TIME`; it is
-    about 1 while the road is known.  Other arguments as for `watch_traffic_`.
-    """
-    h = np.zeros(N_ROAD + 1)
-    total = 0.0
-    count = 0
-    for k in range(n):
-        s = slot[k]
-        if s < 0 or status[k] != 0 or age[s] <= 3 or not (valid[k, 0] and valid[k, 2]):
-            continue
-        g = guide_of[s]
-        if g == FREE:
-            continue
-        x, y, noise = position(z[k], r[k], angle[k])
-        a = N_ROAD + g
-        lane_row_(h, x)
-        v = variance(P, h) + P[a, a] + noise
-        for i in range(N_ROAD):
-            v += 2.0 * h[i] * P[i, a]
-        if v > 0.0:
-            total += min(max((y - value(road, h) - road[a]) / math.sqrt(v), -3.0), 3.0)
-            count += 1
-    if count < 2:
-        return
-    gain = min(dt / UNREST_TIME, 1.0)
-    unrest[0] += gain * (total * total / count - unrest[0])
-    extra = min(max(unrest[0] - 1.5, 0.0), 10.0) * dt
-    P[CHANGE, CHANGE] += extra * par[P_UNREST_CHANGE] ** 2
-    P[CURVATURE, CURVATURE] += extra * par[P_UNREST_CURVATURE] ** 2
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def watch_traffic_(
-    road: FloatArray,
-    P: FloatArray,
-    par: FloatArray,
-    guide_slot: IntArray,
-    guide_unseen: FloatArray,
-    unrest: FloatArray,
+def note_(
+    notes: Any,
     bank: Any,
     objects: Any,
     n: int,
@@ -158,28 +117,60 @@ def watch_traffic_(
     r: FloatArray,
     valid: Any,
     angle: FloatArray,
-    dt: float,
-) -> int:  # pragma: no cover - compiled
-    """Update the road by the vehicles on it, in place.
+) -> None:  # pragma: no cover - compiled
+    """Write down what a scan says of where the vehicles are and of what they do.
 
     Args:
-        road, P, par: as for `localise_`.
+        notes: (capacity,) of `NOTE_DTYPE`, by slot; written.
+        bank, objects: records of the mode bank and of the slots, after this scan's cycle.
+        n: rows of the scan.  slot, status: (rows,) as for `imm.process_scan_`.
+        age: (capacity,) scans in which the slot's object was seen.
+        z, r, valid, angle: (rows, ...) the scan as it was measured.
+    """
+    for s in range(notes.shape[0]):
+        notes[s].seen = False
+        notes[s].new = age[s] <= 1
+    for k in range(n):
+        s = slot[k]
+        if s < 0 or status[k] != 0 or not (valid[k, 0] and valid[k, 2]):
+            continue
+        note = notes[s]
+        note.seen = True
+        note.x, note.y, note.noise = position(z[k], r[k], angle[k])
+        note.changing = 0.0
+        note.off = 0.0
+        for j in range(bank[0].n_modes):
+            if bank[0].direction[j] != 0:
+                note.changing += objects[s].mu[j]
+            if bank[0].off_lane[j]:
+                note.off += objects[s].mu[j]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def learn_(
+    road: FloatArray,
+    P: FloatArray,
+    par: FloatArray,
+    guide_slot: IntArray,
+    guide_unseen: FloatArray,
+    notes: Any,
+    first: int,
+    later: int,
+    dt: float,
+) -> None:  # pragma: no cover - compiled
+    """Update the road by the vehicles of one scan, knowing what became of them; in place.
+
+    Args:
+        road, P, par: as for `road.predict_road_`, at the time of the scan.
         guide_slot: (24,) slot of each guide, `FREE` for none.
         guide_unseen: (24,) for how long it was not measured [s].
-        unrest: (1,) see `follow_bend_`; written.
-        bank, objects: records of the mode bank and of the slots, after this scan's cycle.
-        n: rows of the scan.  slot, status: (N,) as for `imm.process_scan_`.
-        age: (capacity,) scans in which the slot's object was seen.
-        z, r, valid, angle: (N, ...) the scan as it was measured.
-        dt: since the scan before [s].
-
-    Returns:
-        By how many lanes the ego has moved to the left (+1, -1 or 0).  The road's offset and the
-        objects' lateral positions have been changed accordingly.
+        notes: (E, capacity) of `NOTE_DTYPE`, a ring of scans.
+        first: the scan.  later: so many scans after it are known.
+        dt: since the scan before it [s].
     """
     h = np.zeros(N_ROAD + 1)
     wander = par[P_WANDER_STD] ** 2 * max(par[P_WANDER_TIME] / dt, 1.0)
-    guide_of = np.full(objects.shape[0], FREE)
+    guide_of = np.full(notes.shape[1], FREE)
     for g in range(N_GUIDES):
         if guide_slot[g] == FREE:
             continue
@@ -189,26 +180,29 @@ def watch_traffic_(
             free_guide_(P, road, g)
         else:
             guide_of[guide_slot[g]] = g
-    follow_bend_(road, P, par, guide_of, unrest, n, slot, status, age, z, r, valid, angle, dt)
-    for k in range(n):
-        s = slot[k]
-        if s < 0 or status[k] != 0 or not (valid[k, 0] and valid[k, 2]):
-            continue
-        x, y, noise = position(z[k], r[k], angle[k])
-        moving = 0.0
-        off = 0.0
-        for j in range(bank[0].n_modes):
-            if bank[0].direction[j] != 0:
-                moving += objects[s].mu[j]
-            if bank[0].off_lane[j]:
-                off += objects[s].mu[j]
+    for s in range(notes.shape[1]):
+        note = notes[first, s]
         g = guide_of[s]
-        lane_row_(h, x)
-        if g == FREE or age[s] <= 1 or off > 0.5 or not 0.0 < x < SEEN_TO:
+        if note.new and g != FREE:
+            guide_slot[g] = FREE
+            free_guide_(P, road, g)
+            g = FREE
+        if not note.seen:
+            continue
+        x, y, noise = note.x, note.y, note.noise
+        moving = note.changing
+        for k in range(1, later + 1):
+            after = notes[(first + k) % notes.shape[0], s]
+            if after.new:
+                break  # the slot has another object
+            if after.seen:
+                moving = max(moving, after.changing)
+        lane_row_(h, road[WAY], x)
+        if g == FREE or note.off > 0.5 or not 0.0 < x < SEEN_TO:
             if g != FREE:
                 guide_slot[g] = FREE
                 free_guide_(P, road, g)
-            if off > 0.5 or not 0.0 < x < SEEN_TO:
+            if note.off > 0.5 or not 0.0 < x < SEEN_TO:
                 continue
             if g == FREE:
                 for other in range(N_GUIDES):
@@ -241,21 +235,32 @@ def watch_traffic_(
         h[WIDTH] = -lane
         doubt = 1.0 + 5.0 * (moving + between**4)
         scalar_update_(road, P, h, g, 0.0, doubt * wander, np.inf)
-    moved = 0
-    if road[OFFSET] > 0.5 * road[WIDTH]:
-        moved = 1
-    elif road[OFFSET] < -0.5 * road[WIDTH]:
-        moved = -1
-    if moved != 0:
-        shift = moved * road[WIDTH]
-        road[OFFSET] -= shift
-        add_width_(P, OFFSET, -moved)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def change_lane_(
+    road: FloatArray, P: FloatArray, guide_slot: IntArray, moved: int, width: float
+) -> None:  # pragma: no cover - compiled
+    """The ego's lane is another one now, ``moved`` lanes to the left; in place.
+
+    Args:
+        road, P: (N,), (N, N), or (N_ROAD,) without the guides.
+        width: of the lanes [m].
+    """
+    shift = moved * width
+    road[OFFSET] -= shift
+    add_width_(P, OFFSET, -moved)
+    if road.shape[0] > N_ROAD:
         for g in range(N_GUIDES):
             if guide_slot[g] != FREE:
                 road[N_ROAD + g] -= shift
                 add_width_(P, N_ROAD + g, -moved)
-        for s in range(objects.shape[0]):
-            objects[s].mean[2] -= shift
-            for j in range(bank[0].n_modes):
-                objects[s].x[j, 2] -= shift
-    return moved
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def shift_objects_(bank: Any, objects: Any, shift: float) -> None:  # pragma: no cover - compiled
+    """Lateral positions of all objects ``shift`` less [m], in place."""
+    for s in range(objects.shape[0]):
+        objects[s].mean[2] -= shift
+        for j in range(bank[0].n_modes):
+            objects[s].x[j, 2] -= shift

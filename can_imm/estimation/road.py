@@ -5,18 +5,23 @@ through bends.  One Kalman filter keeps apart what the road, the ego and the oth
 
     offset of the ego from the middle of its lane, to the left [m]
     heading of the ego against the lane, to the left [rad]
-    curvature of the road at the ego, to the left [1/m], and its change along the road [1/m²]
     error of the yaw rate sensor [rad/s]
     heading of the radar's axes against the vehicle's [rad]
     width of the lanes [m]
+    how far the ego has come from the first knot [m], which is known
+    curvature of the road at `N_KNOTS` knots, `SPACING` apart, to the left [1/m]
     and for each of up to `N_GUIDES` vehicles its lateral place on the road [m].
 
-The middle of lane k, counted from the ego's lane to the left, is expected at
+Between the knots the curvature is linear: the road is a chain of clothoids (Dickmanns and
+Mysliwetz, 1992, have one).  The knots stand still on the ground; what the ego has passed is
+forgotten, and beyond the last knot the next one is drawn from a curvature that forgets itself along
+the road (a Gauss-Markov process).  The middle of lane k, counted from the ego's lane to the left,
+is expected at
 
-    y(x) = k width - offset - (heading + mounting) x + curvature x²/2 + change x³/6
+    y(x) = k width - offset - (heading + mounting) x + int_0^x (x - s) curvature(s) ds.
 
-(the clothoid of Dickmanns and Mysliwetz, 1992).  The vehicles' places hardly change, and in the
-long run they are the middles of lanes; what all of them do at once the road or the ego has done.
+The vehicles' places hardly change, and in the long run they are the middles of lanes; what all of
+them do at once the road or the ego has done.
 """
 
 from __future__ import annotations
@@ -29,9 +34,12 @@ import numpy as np
 
 from can_imm.types import FloatArray
 
-OFFSET, HEADING, CURVATURE, CHANGE, BIAS, MOUNTING, WIDTH = range(7)
-"""Indices of the state."""
-N_ROAD = 7
+OFFSET, HEADING, BIAS, MOUNTING, WIDTH, WAY, KNOT = range(7)
+"""Indices of the state; `KNOT` is that of the first knot."""
+N_KNOTS = 10
+SPACING = 25.0
+"""Between two knots [m].  The last one is at least 200 m ahead."""
+N_ROAD = KNOT + N_KNOTS
 N_GUIDES = 24
 """Most vehicles that the road is seen by."""
 N = N_ROAD + N_GUIDES
@@ -48,9 +56,6 @@ PARAMETERS = (
     "turn_time",
     "curvature_std",
     "curvature_length",
-    "change_std",
-    "change_length",
-    "far_curvature",
     "bias_std",
     "mounting_std",
     "yaw_noise",
@@ -65,36 +70,32 @@ PARAMETERS = (
     "speed_error_weight",
     "speed_error_most",
     "doubtful",
-    "unrest_change",
-    "unrest_curvature",
+    "hindsight",
+    "sure",
 )
 """Names of the parameters, in their order in the array.
 
 ``width``, ``offset`` and their standard deviations [m] before any traffic was seen; ``*_std`` of
-heading [rad], turning against the road [rad/s], curvature [1/m], its change [1/m²], yaw rate error
-[rad/s] and mounting [rad]: how large they get; ``*_time`` [s] and ``*_length`` [m]: how long they
-stay the same; ``yaw_noise`` [rad/√s] of the heading from the yaw rate, and without it; ``drift``
-[m/√s] of the offset; ``wander_std`` [m] and ``wander_time`` [s] of a vehicle in its lane;
-``freedom`` [m/√s] of its place, and while it changes lanes; ``far_curvature`` [1/m]: how
-differently the road may bend beyond `FAR`; ``*_weight``: by how much more the variances of this
-estimate count than those of white noise, since its errors last;
-``*_most`` [m, m/s]: no larger error is added to the measurements' noise: however little is known of
-where the lanes are far ahead, that a vehicle moves across them is seen; ``doubtful`` [m]: see
-`reporting.doubt_`; ``unrest_*`` [1/m²/√s, 1/m/√s]: see `follow_bend_`.
+heading [rad], turning against the road [rad/s], curvature [1/m], yaw rate error [rad/s] and
+mounting [rad]: how large they get; ``*_time`` [s] and ``*_length`` [m]: how long they stay the
+same; ``yaw_noise`` [rad/√s] of the heading from the yaw rate, and without it; ``drift`` [m/√s] of
+the offset; ``wander_std`` [m] and ``wander_time`` [s] of a vehicle in its lane; ``freedom`` [m/√s]
+of its place, and while it changes lanes; ``*_weight``: by how much more the variances of this
+estimate count than those of white noise, since its errors last; ``*_most`` [m, m/s]: no larger
+error is added to the measurements' noise: however little is known of where the lanes are far ahead,
+that a vehicle moves across them is seen; ``doubtful`` [m]: see `reporting.doubt_`; ``hindsight``
+[s]: see `estimation.guides`; ``sure``: see `relations.hesitate_`.
 """
 (
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,
-    P_TURN_STD, P_TURN_TIME, P_CURVATURE_STD, P_CURVATURE_LENGTH, P_CHANGE_STD, P_CHANGE_LENGTH,
-    P_FAR_CURVATURE, P_BIAS_STD, P_MOUNTING_STD, P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT,
-    P_WANDER_STD, P_WANDER_TIME, P_FREEDOM, P_FREEDOM_CHANGING, P_ERROR_WEIGHT, P_ERROR_MOST,
-    P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST, P_DOUBTFUL, P_UNREST_CHANGE, P_UNREST_CURVATURE,
+    P_TURN_STD, P_TURN_TIME, P_CURVATURE_STD, P_CURVATURE_LENGTH, P_BIAS_STD, P_MOUNTING_STD,
+    P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_WANDER_STD, P_WANDER_TIME, P_FREEDOM,
+    P_FREEDOM_CHANGING, P_ERROR_WEIGHT, P_ERROR_MOST, P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST,
+    P_DOUBTFUL, P_HINDSIGHT, P_SURE,
 ) = range(len(PARAMETERS))  # fmt: skip
 
 USUAL_SPEED = 25.0
 """Taken for the ego's where it is unknown [m/s]."""
-
-FAR = 100.0
-"""Beyond this distance [m] the curvature is taken to change no more."""
 
 BIAS_TIME = 120.0
 """How long the error of the yaw rate sensor stays the same [s]."""
@@ -104,18 +105,24 @@ FREE = -1
 
 
 def new_road(par: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """State (31,) and covariance (31, 31) before anything was seen."""
+    """State (N,) and covariance (N, N) before anything was seen."""
     x = np.zeros(N)
     x[OFFSET], x[WIDTH] = par[P_OFFSET], par[P_WIDTH]
-    std = np.zeros(N)
-    std[:N_ROAD] = [
-        par[k]
-        for k in (
-            P_OFFSET_STD, P_HEADING_STD, P_CURVATURE_STD, P_CHANGE_STD, P_BIAS_STD,
-            P_MOUNTING_STD, P_WIDTH_STD,
-        )
-    ]  # fmt: skip
-    return x, np.diag(np.square(std))
+    P = np.zeros((N, N))
+    for i, k in (
+        (OFFSET, P_OFFSET_STD),
+        (HEADING, P_HEADING_STD),
+        (BIAS, P_BIAS_STD),
+        (MOUNTING, P_MOUNTING_STD),
+        (WIDTH, P_WIDTH_STD),
+    ):
+        P[i, i] = par[k] ** 2
+    knots = SPACING * np.arange(N_KNOTS)
+    apart = np.abs(knots[:, None] - knots)
+    P[KNOT:N_ROAD, KNOT:N_ROAD] = par[P_CURVATURE_STD] ** 2 * np.exp(
+        -apart / par[P_CURVATURE_LENGTH]
+    )
+    return x, P
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -125,27 +132,28 @@ def scalar_update_(
     """Kalman update by one value z = h x + noise of variance r, in place.
 
     Args:
-        x: (31,).  P: (31, 31).  h: (8,) row: the road's states, and that of guide g.
+        x: (N,).  P: (N, N).  h: (N_ROAD + 1,) row: the road's states, and that of guide g.
         g: number of the guide, `FREE` for none.
 
     Returns:
         False, and nothing changed, if its squared normalised innovation is above ``gate``.
     """
     e, s = z, r
-    k = np.zeros(N)
+    n = x.shape[0]
+    k = np.zeros(n)
     for j in range(N_ROAD + 1):
         c = j if j < N_ROAD else N_ROAD + g
         if h[j] == 0.0 or (j == N_ROAD and g < 0):
             continue
         e -= h[j] * x[c]
-        for i in range(N):
+        for i in range(n):
             k[i] += P[i, c] * h[j]
     for j in range(N_ROAD + 1):
         if j < N_ROAD or g >= 0:
             s += h[j] * k[j if j < N_ROAD else N_ROAD + g]
     if not (s > 0.0 and e * e <= gate * s):
         return False
-    for i in range(N):
+    for i in range(n):
         if k[i] == 0.0:
             continue
         x[i] += k[i] * e / s
@@ -157,28 +165,60 @@ def scalar_update_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def bend_row_(
+    h: FloatArray, way: float, x: float, arm: bool
+) -> None:  # pragma: no cover - compiled
+    """Row h of the knots for the integral of the curvature from 0 to x [m] ahead of the ego.
+
+    Args:
+        way: state `WAY` [m].
+        arm: the curvature counts times its distance from x: a lateral position, not a direction.
+    """
+    for i in range(KNOT, N_ROAD):
+        h[i] = 0.0
+    if x <= 0.0:
+        return
+    to = way + x
+    for i in range(N_KNOTS):
+        begin = max(i * SPACING, way)
+        end = min((i + 1) * SPACING, to) if i < N_KNOTS - 1 else to
+        if end <= begin:
+            continue
+        # Simpson's rule is exact: the curvature is linear here, and so is the arm
+        for place in range(3):
+            s = begin + 0.5 * place * (end - begin)
+            weight = (4.0 if place == 1 else 1.0) * (end - begin) / 6.0
+            if arm:
+                weight *= to - s
+            share = s / SPACING - i if i < N_KNOTS - 1 else 0.0
+            h[KNOT + i] += (1.0 - share) * weight
+            if share > 0.0:
+                h[KNOT + i + 1] += share * weight
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def predict_road_(
     x: FloatArray, P: FloatArray, par: FloatArray, dt: float, speed: float, yaw_rate: float
 ) -> None:  # pragma: no cover - compiled
     """Move the ego on by ``dt`` seconds, in place.
 
     Args:
-        x: (31,).  P: (31, 31).  par: `PARAMETERS`.
+        x: (N,), or (N_ROAD,) without the guides.  P: square.  par: `PARAMETERS`.
         speed, yaw_rate: of the ego [m/s, rad/s]; NaN where unknown.
     """
     known = speed == speed and yaw_rate == yaw_rate
     v = speed if speed == speed else USUAL_SPEED
     F = np.eye(N_ROAD)
-    F[CURVATURE, CURVATURE] = math.exp(-abs(v) * dt / par[P_CURVATURE_LENGTH])
-    F[CURVATURE, CHANGE] = v * dt
-    F[CHANGE, CHANGE] = math.exp(-abs(v) * dt / par[P_CHANGE_LENGTH])
     F[BIAS, BIAS] = math.exp(-dt / BIAS_TIME)
     F[OFFSET, HEADING] = v * dt
     turned = 0.0
     if known:
-        F[OFFSET, CURVATURE] = -0.5 * v * v * dt * dt
+        bend_row_(F[OFFSET], x[WAY], v * dt, True)
+        bend_row_(F[HEADING], x[WAY], v * dt, False)
+        for i in range(KNOT, N_ROAD):
+            F[OFFSET, i] = -F[OFFSET, i]
+            F[HEADING, i] = -F[HEADING, i]
         F[OFFSET, BIAS] = -0.5 * v * dt * dt
-        F[HEADING, CURVATURE] = -v * dt
         F[HEADING, BIAS] = -dt
         turned = yaw_rate * dt
     y = np.zeros(N_ROAD)
@@ -193,11 +233,10 @@ def predict_road_(
     yaw = par[P_YAW_NOISE] if known else par[P_YAW_NOISE_UNKNOWN]
     P[HEADING, HEADING] += yaw**2 * dt
     P[OFFSET, OFFSET] += par[P_DRIFT] ** 2 * dt
-    P[CURVATURE, CURVATURE] += (
-        par[P_CURVATURE_STD] ** 2 * (1.0 - F[CURVATURE, CURVATURE] ** 2) * 0.1
-    )
-    P[CHANGE, CHANGE] += par[P_CHANGE_STD] ** 2 * (1.0 - F[CHANGE, CHANGE] ** 2)
     P[BIAS, BIAS] += par[P_BIAS_STD] ** 2 * (1.0 - F[BIAS, BIAS] ** 2)
+    x[WAY] = max(x[WAY] + v * dt, 0.0)
+    while x[WAY] >= SPACING:
+        pass_knot_(x, P, par)
     # A driver keeps to the lane and along it, for a while at a time; what the ego turns is mostly
     # the road's bend.
     h = np.zeros(N_ROAD + 1)
@@ -213,43 +252,71 @@ def predict_road_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def pass_knot_(
+    x: FloatArray, P: FloatArray, par: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """The ego passes the second knot, in place: the first is forgotten, another added far ahead."""
+    last = N_ROAD - 1
+    x[WAY] -= SPACING
+    for i in range(KNOT, last):
+        x[i] = x[i + 1]
+    n = x.shape[0]
+    for i in range(KNOT, last):
+        for j in range(n):
+            P[i, j] = P[i + 1, j]
+    for i in range(KNOT, last):
+        for j in range(n):
+            P[j, i] = P[j, i + 1]
+    memory = math.exp(-SPACING / par[P_CURVATURE_LENGTH])
+    x[last] = memory * x[last - 1]
+    for j in range(n):
+        P[last, j] = memory * P[last - 1, j]
+        P[j, last] = P[last, j]
+    P[last, last] = memory**2 * P[last - 1, last - 1] + par[P_CURVATURE_STD] ** 2 * (
+        1.0 - memory**2
+    )
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def turn_with_road_(
     x: FloatArray, P: FloatArray, par: FloatArray, speed: float, yaw_rate: float, weight: float
 ) -> None:  # pragma: no cover - compiled
     """The ego turns as the road does, with ``weight`` times the usual variance; in place."""
     if speed == speed and yaw_rate == yaw_rate:
         h = np.zeros(N_ROAD + 1)
+        here = x[WAY] / SPACING
         h[BIAS] = 1.0
-        h[CURVATURE] = speed
+        h[KNOT] = speed * (1.0 - here)
+        h[KNOT + 1] = speed * here
         scalar_update_(x, P, h, FREE, yaw_rate, par[P_TURN_STD] ** 2 * weight, np.inf)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def lane_row_(h: FloatArray, x: float) -> None:  # pragma: no cover - compiled
-    """Row h (>= 7,): h @ state is the lateral position of the ego's lane at distance x [m]."""
-    far = min(max(x, 0.0), FAR)
+def lane_row_(h: FloatArray, way: float, x: float) -> None:  # pragma: no cover - compiled
+    """Row h (>= N_ROAD,): h @ state is the lateral position of the ego's lane at distance x [m].
+
+    Args:
+        way: state `WAY` [m].
+    """
     h[OFFSET] = -1.0
     h[HEADING] = -x
-    beyond = max(x, 0.0) - far
-    h[CURVATURE] = 0.5 * (far + beyond) ** 2
-    h[CHANGE] = far * (far * far / 6.0 + 0.5 * beyond * (far + beyond))
     h[BIAS] = 0.0
     h[MOUNTING] = -x
     h[WIDTH] = 0.0
+    h[WAY] = 0.0
+    bend_row_(h, way, x, True)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def slope_row_(h: FloatArray, x: float) -> None:  # pragma: no cover - compiled
+def slope_row_(h: FloatArray, way: float, x: float) -> None:  # pragma: no cover - compiled
     """The derivative of `lane_row_` by x: direction of the road there [rad]."""
-    far = min(max(x, 0.0), FAR)
     h[OFFSET] = 0.0
     h[HEADING] = -1.0
-    beyond = max(x, 0.0) - far
-    h[CURVATURE] = far + beyond
-    h[CHANGE] = far * (0.5 * far + beyond)
     h[BIAS] = 0.0
     h[MOUNTING] = -1.0
     h[WIDTH] = 0.0
+    h[WAY] = 0.0
+    bend_row_(h, way, x, False)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -278,17 +345,32 @@ def place(
     """Lateral position and speed against the ego of a vehicle that follows the ego's lane.
 
     Args:
-        road: (31,) state.  h: (8,) scratch.
+        road: (N,) state.  h: (N_ROAD + 1,) scratch.
         x, vx: where it is ahead of the ego [m], and how much faster [m/s].
         speed: of the ego [m/s], NaN where unknown.
     """
-    lane_row_(h, x)
+    lane_row_(h, road[WAY], x)
     y = value(road, h)
     vy = 0.0
     if speed == speed:
-        slope_row_(h, x)
+        slope_row_(h, road[WAY], x)
         vy = (speed + vx) * value(road, h) + speed * road[MOUNTING]
     return y, vy
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def lane_middles(roads: FloatArray, x: FloatArray) -> FloatArray:  # pragma: no cover - compiled
+    """Lateral positions (M,) [m] of the middle of the ego's lane at the distances x (M,) [m].
+
+    Args:
+        roads: (M, N_ROAD) a state of the road for each.
+    """
+    y = np.zeros(len(x))
+    h = np.zeros(N_ROAD + 1)
+    for k in range(len(x)):
+        lane_row_(h, roads[k, WAY], x[k])
+        y[k] = value(roads[k], h)
+    return y
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -309,8 +391,9 @@ def localise_(
     the speed across the lane.  The uncertainty of the road adds to the variances.
 
     Args:
-        road: (31,).  P: (31, 31).  par: `PARAMETERS`.
-        n: rows in use.  z, r: (N, 4) values and variances.  valid: (N, 4).  angle: (N,) [rad].
+        road: (N,).  P: (N, N).  par: `PARAMETERS`.
+        n: rows in use.  z, r: (rows, 4) values and variances.  valid: (rows, 4).
+        angle: (rows,) [rad].
         speed: of the ego [m/s], NaN where unknown.
     """
     h = np.zeros(N_ROAD + 1)
@@ -323,20 +406,16 @@ def localise_(
         if not (abs(x) < 1e4 and abs(vx) < 1e4):
             continue
         y, vy = place(road, h, x, vx, speed)
-        lane_row_(h, x)
-        # Further on the road may bend in another way.
-        beyond = max(x - FAR, 0.0)
-        bend = 0.5 * par[P_FAR_CURVATURE] * beyond**2
-        error = par[P_ERROR_WEIGHT] * (variance(P, h) + bend**2)
+        lane_row_(h, road[WAY], x)
+        error = par[P_ERROR_WEIGHT] * variance(P, h)
         error = min(error, par[P_ERROR_MOST] ** 2)
         z[k, 0] -= y * sin
         z[k, 2] -= y * cos
         r[k, 0] += error * sin * sin
         r[k, 2] += error * cos * cos
         if speed == speed:
-            slope_row_(h, x)
-            bend = par[P_FAR_CURVATURE] * beyond
-            error = par[P_SPEED_ERROR_WEIGHT] * (variance(P, h) + bend**2) * (speed + vx) ** 2
+            slope_row_(h, road[WAY], x)
+            error = par[P_SPEED_ERROR_WEIGHT] * variance(P, h) * (speed + vx) ** 2
             error = min(error, par[P_SPEED_ERROR_MOST] ** 2)
             z[k, 1] -= vy * sin
             z[k, 3] -= vy * cos

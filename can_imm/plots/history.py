@@ -8,16 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from can_imm.estimation.road import (
-    CHANGE,
-    CURVATURE,
-    FAR,
-    HEADING,
-    MOUNTING,
-    N_ROAD,
-    OFFSET,
-    WIDTH,
-)
+from can_imm.estimation.road import N_ROAD, OFFSET, WIDTH, lane_middles
 from can_imm.types import FloatArray
 
 if TYPE_CHECKING:
@@ -105,22 +96,5 @@ class History:
         lane = -np.cumsum(np.where(np.abs(jumps) > 0.6, np.round(jumps), 0.0))
         at = np.clip(np.searchsorted(t_ns, rows["t_ns"], "right") - 1, 0, None)
         x = rows["x"].astype(np.float64)
-        rows["y"] += (lane[at] * width - lane_middle(roads[at], x)).astype(np.float32)
+        rows["y"] += (lane[at] * width - lane_middles(roads[at], x)).astype(np.float32)
         return Recorded(rows, t_ns, roads[:, OFFSET] + lane * width, width)
-
-
-def lane_middle(roads: FloatArray, x: FloatArray) -> FloatArray:
-    """Lateral position (N,) [m] of the middle of the ego's lane at the distances x (N,) [m].
-
-    Args:
-        roads: (N, 7) states of `can_imm.estimation.road`.
-    """
-    # as `lane_row_`: straight behind, and from FAR on the curvature changes no more
-    ahead = np.maximum(x, 0.0)
-    far = np.minimum(ahead, FAR)
-    return np.asarray(
-        -roads[:, OFFSET]
-        - (roads[:, HEADING] + roads[:, MOUNTING]) * x
-        + roads[:, CURVATURE] * ahead**2 / 2
-        + roads[:, CHANGE] * far * (far**2 / 6 + (ahead - far) * ahead / 2)
-    )

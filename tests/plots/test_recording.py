@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from can_imm.estimation import road
 from can_imm.events import Event
-from can_imm.plots.history import HISTORY_DTYPE, History, Recorded, lane_middle
+from can_imm.plots.history import HISTORY_DTYPE, History, Recorded
 from can_imm.plots.recording import draw_recording, lane_lines
 from can_imm.plots.style import COLOURS
 from can_imm.types import REPORT_DTYPE, Manoeuvre
@@ -176,27 +176,20 @@ def test_history_keeps_what_it_was_told():
     assert len(History().recorded().rows) == 0
 
 
-def test_the_middle_of_the_lane_is_the_road_filter_s():
-    random = np.random.default_rng(2)
-    states = random.normal(size=(20, road.N_ROAD)) * [0.5, 0.02, 1e-3, 1e-5, 0.01, 0.01, 0.1]
-    x, row = random.uniform(-50, 200, 20), np.zeros(road.N_ROAD + 1)
-    expected = []
-    for state, distance in zip(states, x, strict=True):
-        road.lane_row_(row, distance)
-        expected.append(row[: road.N_ROAD] @ state)
-    assert lane_middle(states, x) == pytest.approx(np.array(expected))
-
-
 class Road:
-    """A road that stays straight while the ego moves over to the left lane."""
+    """A road of one radius while the ego moves over to the left lane."""
 
-    def __init__(self) -> None:
+    def __init__(self, curvature: float) -> None:
         self.x = np.zeros(road.N_ROAD)
         self.x[road.WIDTH] = 3.5
+        self.x[road.KNOT :] = curvature
 
 
-def test_across_the_road_a_car_keeps_its_lane_while_the_ego_changes_its_own(tmp_path, drawn):
-    ahead = Road()
+@pytest.mark.parametrize("curvature", [0.0, 1e-3])
+def test_across_the_road_a_car_keeps_its_lane_while_the_ego_changes_its_own(
+    tmp_path, drawn, curvature
+):
+    ahead = Road(curvature)
     history = History(ahead)
     reports = np.zeros(1, REPORT_DTYPE)
     reports["duplicate_of"], reports["manoeuvre"] = -1, KL
@@ -204,8 +197,9 @@ def test_across_the_road_a_car_keeps_its_lane_while_the_ego_changes_its_own(tmp_
         left = 3.5 * k / 40  # of where the ego was at first
         ahead.x = ahead.x.copy()
         ahead.x[road.OFFSET] = left if left <= 1.75 else left - 3.5
+        ahead.x[road.WAY] = 3.0 * k % road.SPACING
         reports["t_ns"], reports["age"] = k * S // 10, k + 1
-        reports["x"] = [50, 0, 3.5 - left, 0]
+        reports["x"] = [50, 0, 3.5 - left + curvature * 50**2 / 2, 0]
         history.watch(k * S // 10, reports)
         history(k * S // 10, reports)
     recorded = history.recorded()
