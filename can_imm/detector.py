@@ -203,6 +203,8 @@ class Detector:
         """Compile, or load from the cache, every kernel that `step` and `predict` call."""
         scan = Scan(1)
         self._grow_rows(self.capacity)
+        if self._road is not None:
+            self._road.warm_up(self._id, self._memory, self.reports)
         hesitate_(self._id, self._memory, 0.5, self.reports, 0)
         relate_(self._id, self._memory, self.reports, 0)
         shift_lanes_(self._memory, 0)

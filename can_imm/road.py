@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from can_imm.estimation import guides, road
-from can_imm.relations import MEMORY_DTYPE
 from can_imm.reporting import doubt_, globalise_
-from can_imm.types import REPORT_DTYPE, VY, FloatArray, IntArray, Scan
+from can_imm.types import VY, FloatArray, IntArray, Scan
 
 if TYPE_CHECKING:
     from can_imm.manoeuvres import ModeBank
@@ -53,7 +52,6 @@ class RoadFrame:
         self._t_ns = -1
         self._speed = math.nan
         self._h = np.zeros(road.N_ROAD + 1)
-        self._warm_up()
 
     @property
     def width(self) -> float:
@@ -68,8 +66,8 @@ class RoadFrame:
     def _without_guides(self) -> FloatArray:
         return self._P_past[: road.N_ROAD, : road.N_ROAD].copy()
 
-    def _warm_up(self) -> None:
-        """Compile, or load from the cache."""
+    def warm_up(self, ids: IntArray, memory: Any, reports: np.ndarray[Any, Any]) -> None:
+        """Compile, or load from the cache; no slot may be in use."""
         scan = Scan(1)
         for x, P in ((self.x.copy(), self.P.copy()), (self._past.copy(), self._P_past.copy())):
             road.predict_road_(x, P, self._par, 0.1, 20.0, 0.0)
@@ -77,9 +75,7 @@ class RoadFrame:
         road.localise_(x, P, self._par, 0, scan.z, scan.std, scan.valid, scan.angle, 20.0)
         road.turn_with_road_(x, P, self._par, 20.0, 0.0, 1.0)
         road.place(x, self._h, 0.0, 0.0, 20.0)
-        nobody = np.zeros(0, np.int32)
-        reports, memory = np.zeros(1, REPORT_DTYPE), np.zeros(0, MEMORY_DTYPE)
-        doubt_(x, P, 1.0, 20.0, self._h, nobody, memory, reports)
+        doubt_(x, P, 1.0, 20.0, self._h, ids, memory, reports)
 
     def move(self, t_ns: int, speed: float, yaw_rate: float) -> None:
         """Move the ego on to the time of the next scan.
