@@ -11,7 +11,8 @@ import math
 import numba
 import numpy as np
 
-from can_imm.types import FloatArray
+from can_imm.estimation.stack import stack_vector
+from can_imm.types import MAX_STATES, FloatArray
 
 SQRT_2 = math.sqrt(2.0)
 LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
@@ -138,14 +139,13 @@ def normal_probability(lower: float, upper: float) -> float:  # pragma: no cover
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def interval_mass(
-    x: FloatArray, P: FloatArray, i0: int, lower: float, upper: float
+    mean: float, p: float, lower: float, upper: float
 ) -> float:  # pragma: no cover - compiled
-    """What `truncate_` would return, without its work on the moments."""
-    p = P[i0, i0]
+    """What `truncate_` would return for a state of this mean and variance."""
     if not (p > 0.0 and p < np.inf):
         return np.nan
     sd = math.sqrt(p)
-    return normal_mass((lower - x[i0]) / sd, (upper - x[i0]) / sd)
+    return normal_mass((lower - mean) / sd, (upper - mean) / sd)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -157,7 +157,6 @@ def truncate_(
     lower: float,
     upper: float,
     floor: float,
-    work: FloatArray,
 ) -> float:  # pragma: no cover - compiled
     """Restrict state ``i0`` to [lower, upper]: exact truncated moments, in place.
 
@@ -167,12 +166,12 @@ def truncate_(
         n: number of states; the arrays may be larger, what lies beyond is left alone.
         x: (n,) mean.  P: (n, n) covariance.
         floor: smallest variance that is left to state ``i0``.
-        work: (>= 1, n) scratch.
 
     Returns:
         Log of the mass that the Gaussian had inside, clipped at `LOG_MASS_FLOOR`; NaN (and x, P
         untouched) if the state's variance is not positive or not finite.
     """
+    slope = stack_vector(MAX_STATES)
     p = P[i0, i0]
     if not (p > 0.0 and p < np.inf):
         return np.nan
@@ -183,12 +182,12 @@ def truncate_(
     log_mass, mean, variance = truncated_normal(low, high)
     variance = min(max(variance, floor / p), 1.0)
     for i in range(n):
-        work[0, i] = P[i, i0] / p
-        x[i] += work[0, i] * mean * sd
+        slope[i] = P[i, i0] / p
+        x[i] += slope[i] * mean * sd
     shrink = p * (variance - 1.0)
     for i in range(n):
         for j in range(i + 1):
-            v = P[i, j] + work[0, i] * work[0, j] * shrink
+            v = P[i, j] + slope[i] * slope[j] * shrink
             P[i, j] = v
             P[j, i] = v
     return log_mass
@@ -196,7 +195,7 @@ def truncate_(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def project_(
-    n: int, x: FloatArray, P: FloatArray, i0: int, d: float, floor: float, work: FloatArray
+    n: int, x: FloatArray, P: FloatArray, i0: int, d: float, floor: float
 ) -> bool:  # pragma: no cover - compiled
     """Project onto the hyperplane x[i0] = d with W = P^-1, in place ((24) to (28), corrected).
 
@@ -206,17 +205,18 @@ def project_(
     Returns:
         False (and x, P untouched) if the state's variance is not positive or not finite.
     """
+    slope = stack_vector(MAX_STATES)
     p = P[i0, i0]
     if not (p > 0.0 and p < np.inf):
         return False
     e = x[i0] - d
     for i in range(n):
-        work[0, i] = P[i, i0] / p
+        slope[i] = P[i, i0] / p
     for i in range(n):
-        x[i] -= work[0, i] * e
+        x[i] -= slope[i] * e
     for i in range(n):
         for j in range(i + 1):
-            v = P[i, j] - work[0, i] * p * work[0, j]
+            v = P[i, j] - slope[i] * p * slope[j]
             P[i, j] = v
             P[j, i] = v
     x[i0] = d

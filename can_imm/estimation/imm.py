@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from can_imm.estimation.constraints import normal_mass
-from can_imm.estimation.interaction import mix_, nearest_lane, reference, transitions_
+from can_imm.estimation.interaction import blend_, mix_, nearest_lane, reference, transitions_
 from can_imm.estimation.kalman import predict_
 from can_imm.estimation.layout import (
     GROUND,
@@ -30,7 +30,8 @@ from can_imm.estimation.modes import (
     update_particles_,
 )
 from can_imm.estimation.noise import NoiseState
-from can_imm.types import FloatArray
+from can_imm.estimation.stack import stack_matrix, stack_vector
+from can_imm.types import MAX_STATES, FloatArray
 
 TWO_PI = 2.0 * math.pi
 
@@ -55,21 +56,21 @@ def combine_(n: int, bank: Any, obj: Any, work: Any) -> None:  # pragma: no cove
     """Combined mean and covariance (19)(20) of all modes that are above the floor."""
     n_modes = bank.n_modes
     present_(bank, obj, work.w)
+    mean, cov = stack_vector(MAX_STATES), stack_matrix(MAX_STATES, MAX_STATES)
     for s in range(n):
-        v = 0.0
-        for j in range(n_modes):
-            v += work.w[j] * obj.x[j, s]
-        obj.mean[s] = v
-    for s in range(n):
+        mean[s] = 0.0
         for t in range(s + 1):
-            v = 0.0
-            for j in range(n_modes):
-                if work.w[j] > 0.0:
-                    v += work.w[j] * (
-                        obj.P[j, s, t] + (obj.x[j, s] - obj.mean[s]) * (obj.x[j, t] - obj.mean[t])
-                    )
-            obj.cov[s, t] = v
-            obj.cov[t, s] = v
+            cov[s, t] = 0.0
+    total = 0.0
+    for j in range(n_modes):
+        if work.w[j] > 0.0:
+            total += work.w[j]
+            blend_(n, work.w[j], total, obj.x[j], obj.P[j], mean, cov)
+    for s in range(n):
+        obj.mean[s] = mean[s]
+        for t in range(s + 1):
+            obj.cov[s, t] = cov[s, t]
+            obj.cov[t, s] = cov[s, t]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -101,6 +102,17 @@ def normalise_(
     for j in range(n):
         mu[j] /= t
     return True
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def put_(
+    n: int, x: FloatArray, P: FloatArray, to_x: FloatArray, to_P: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """Copy mean x (n,) and covariance P (n, n)."""
+    for s in range(n):
+        to_x[s] = x[s]
+        for t in range(n):
+            to_P[s, t] = P[s, t]
 
 
 OK, OUTLIER, FAILED = 0, 1, 2
@@ -253,6 +265,7 @@ def cycle_(
     peak = peak_density(r, valid)
     worth = math.log(bank.mu_floor * NEGLIGIBLE_RISE)  # -inf without a floor
     best = -np.inf
+    x, P = stack_vector(MAX_STATES), stack_matrix(MAX_STATES, MAX_STATES)
     for k in range(n_modes):
         j = work.order[k]
         c = work.c[j]
@@ -264,9 +277,10 @@ def cycle_(
                 p = obj.Pi[i, j] * work.mu[i]
                 work.w[i] = p / c if p > NEGLIGIBLE_WEIGHT * c else 0.0
             if not bank.is_particle[j]:
-                mix_(n, bank, obj, work, j, m)
-                predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
-                log_l = update_mode_(n, bank, work, j, z, r, valid, age)
+                mix_(n, bank, obj, work, j, m, x, P)
+                predict_(n, x, P, bank.F[m, j], bank.Q[m, j])
+                log_l = update_mode_(n, bank, work, j, x, P, z, r, valid, age)
+                put_(n, x, P, work.x[j], work.P[j])
                 best = max(best, math.log(c) + log_l)
             elif (
                 math.log(c) + peak + particle_limit(bank, obj, work, j, m, z, r, valid, age)
@@ -283,10 +297,7 @@ def cycle_(
     if not normalise_(n_modes, obj.mu, obj.log_l, work.c, bank.mu_floor):
         return FAILED
     for j in range(n_modes):
-        for s in range(n):
-            obj.x[j, s] = work.x[j, s]
-            for t in range(n):
-                obj.P[j, s, t] = work.P[j, s, t]
+        put_(n, work.x[j], work.P[j], obj.x[j], obj.P[j])
     combine_(n, bank, obj, work)
     learn_lane_(bank, obj)
     return OK
@@ -307,9 +318,8 @@ def birth_(
     obj.lane_scans = 0.0
     work.lane_width = obj.lane_width
     work.elapsed = 0.1
+    x, P = stack_vector(MAX_STATES), stack_matrix(MAX_STATES, MAX_STATES)
     for j in range(n_modes):
-        x = work.x[j]
-        P = work.P[j]
         for s in range(n):
             x[s] = 0.0
             for t in range(n):
@@ -338,7 +348,8 @@ def birth_(
                         (base + bank.bound_upper[j, c] - v) / sd,
                     )
                 )
-        log_l = update_mode_(n, bank, work, j, z, r, valid, age)
+        log_l = update_mode_(n, bank, work, j, x, P, z, r, valid, age)
+        put_(n, x, P, work.x[j], work.P[j])
         if bank.is_particle[j]:
             log_l = LOG_FLOOR  # entered from another mode, never born into
         obj.log_l[j] = log_l if log_l > LOG_FLOOR else LOG_FLOOR
@@ -346,10 +357,7 @@ def birth_(
     if not normalise_(n_modes, obj.mu, obj.log_l, work.c, bank.mu_floor):
         return FAILED
     for j in range(n_modes):
-        for s in range(n):
-            obj.x[j, s] = work.x[j, s]
-            for t in range(n):
-                obj.P[j, s, t] = work.P[j, s, t]
+        put_(n, work.x[j], work.P[j], obj.x[j], obj.P[j])
     combine_(n, bank, obj, work)
     return OK
 
@@ -374,11 +382,8 @@ def extrapolate_(
         for i in range(n_modes):
             v += bank.Pi[m, i, j] * obj.mu[i]
         mu[j] = v
-        for s in range(n):
-            work.x[j, s] = obj.x[j, s]
-            for t in range(n):
-                work.P[j, s, t] = obj.P[j, s, t]
-        predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
+        put_(n, obj.x[j], obj.P[j], work.x[j], work.P[j])
+        predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j])
         for s in range(n):
             x[s] += work.c[j] * work.x[j, s]
     for j in range(n_modes):
@@ -438,14 +443,14 @@ def process_scan_(
         if steps[k] < 0:
             status[k] = birth_(bank[0], objects[s], work[0], z[k], r[k], valid[k], age)
             continue
-        one = (
-            bank[0], objects[s], work[0], steps[k], z[k], r[k], valid[k], age, gate,
-            particles[s], spare, weights, noise,
-        )  # fmt: skip
-        # The number of states as a constant lets the compiler unroll everything.
+        # The number of states as a constant lets the compiler unroll everything; in a call with a
+        # starred tuple it would be none.
         if bank[0].n_states == 4:
-            status[k] = cycle_(4, *one)
+            status[k] = cycle_(4, bank[0], objects[s], work[0], steps[k], z[k], r[k], valid[k], age,
+                               gate, particles[s], spare, weights, noise)  # fmt: skip
         elif bank[0].n_states == 5:
-            status[k] = cycle_(5, *one)
+            status[k] = cycle_(5, bank[0], objects[s], work[0], steps[k], z[k], r[k], valid[k], age,
+                               gate, particles[s], spare, weights, noise)  # fmt: skip
         else:
-            status[k] = cycle_(bank[0].n_states, *one)
+            status[k] = cycle_(6, bank[0], objects[s], work[0], steps[k], z[k], r[k], valid[k], age,
+                               gate, particles[s], spare, weights, noise)  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from can_imm.estimation.particles import PARTICLE_DTYPE
-from can_imm.types import VX
+from can_imm.types import MAX_STATES, VX
 
 LOG_FLOOR = -1e30
 
@@ -35,9 +35,6 @@ that what stands still or comes towards us is never claimed."""
 
 MAX_MODES = 24
 """Largest number of modes in a bank."""
-
-MAX_STATES = 6
-"""Largest number of states in a mode."""
 
 MAX_STEPS = 201
 """Length of the tables over elapsed steps: two seconds of 10 ms."""

@@ -36,7 +36,8 @@ from can_imm.estimation.particles import (
     resample_,
     weigh_,
 )
-from can_imm.types import AX, VX, VY, FloatArray, Y
+from can_imm.estimation.stack import element, stack_matrix, stack_vector
+from can_imm.types import AX, MAX_STATES, VX, VY, FloatArray, Y
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -50,14 +51,16 @@ def constrain_soft_(
     """
     bad = 0.0
     for c in range(bank.n_soft[j]):
-        s = bank.soft_state[j, c]
+        state = bank.soft_state[j, c]
         value = bank.soft_value[j, c] + reference(
-            bank.soft_kind[j, c], bank.soft_lanes[j, c], work, x[s]
+            bank.soft_kind[j, c], bank.soft_lanes[j, c], work, element(n, x, state)
         )
         r = bank.soft_r[j, c]
         if bank.soft_density[j, c]:
             r /= work.elapsed
-        bad += 0.0 * update_state_(n, x, P, s, value, r, work.row)[1]
+        for s in range(n):
+            if s == state:  # a constant in each branch, see `stack`
+                bad += 0.0 * update_state_(n, x, P, s, value, r)[1]
     return bad
 
 
@@ -71,8 +74,6 @@ def correct_(
     valid: Any,
     age: float,
     angle: float,
-    h: FloatArray,
-    row: FloatArray,
 ) -> float:  # pragma: no cover - compiled
     """Measurement update with the valid components of z, in place.
 
@@ -81,26 +82,26 @@ def correct_(
         angle: of the axes in which z was measured, against those of ``x`` [rad].
         age: how long before the time of ``x`` the measurement was taken [s]; a position measured
             then is x - age vx + age^2/2 ax now.
-        h: (n,) scratch.  row: (>= 2, n) scratch.
 
     Returns:
         Log density of z; NaN on a numeric failure.
     """
-    cos, sin = 1.0, 0.0
-    if angle != 0.0:
-        cos, sin = math.cos(angle), math.sin(angle)
     # one logarithm for all components
     square = 0.0
     product = 1.0
     count = 0
+    if age == 0.0 and angle == 0.0:
+        for c in range(4):
+            if valid[c]:
+                e, v = update_state_(n, x, P, c, z[c], r[c])
+                square += e * e / v
+                product *= v
+                count += 1
+        return -0.5 * (count * LOG_2PI + math.log(product) + square)
+    cos, sin = math.cos(angle), math.sin(angle)
+    h = stack_vector(MAX_STATES)
     for c in range(4):
         if not valid[c]:
-            continue
-        count += 1
-        if age == 0.0 and angle == 0.0:
-            e, v = update_state_(n, x, P, c, z[c], r[c], row)
-            square += e * e / v
-            product *= v
             continue
         for s in range(n):
             h[s] = 0.0
@@ -120,9 +121,10 @@ def correct_(
                 h[s + 1] = share
                 if a < n:
                     h[a] = -age * share
-        e, v = update_row_(n, x, P, h, z[c], r[c], row)
+        e, v = update_row_(n, x, P, h, z[c], r[c])
         square += e * e / v
         product *= v
+        count += 1
     return -0.5 * (count * LOG_2PI + math.log(product) + square)
 
 
@@ -135,23 +137,23 @@ def mass_(
     Args:
         state: (n_bounds,) the bounded states; their intervals are in work.lower and work.upper.
     """
-    if n_bounds == 0:
-        return 0.0
-    last = n_bounds - 1
-    if last == 0:
-        return interval_mass(x, P, state[0], work.lower[0], work.upper[0])
+    left_x, left_P = stack_vector(MAX_STATES), stack_matrix(MAX_STATES, MAX_STATES)
     for s in range(n):
-        work.tx[s] = x[s]
+        left_x[s] = x[s]
         for t in range(n):
-            work.tP[s, t] = P[s, t]
+            left_P[s, t] = P[s, t]
     log_mass = 0.0
-    for c in range(last):
-        log_mass += truncate_(
-            n, work.tx, work.tP, state[c], work.lower[c], work.upper[c], floor, work.row
-        )
-    return log_mass + interval_mass(
-        work.tx, work.tP, state[last], work.lower[last], work.upper[last]
-    )
+    for c in range(n_bounds):
+        for s in range(n):
+            if s != state[c]:
+                continue
+            if c == n_bounds - 1:  # nobody needs the moments
+                log_mass += interval_mass(left_x[s], left_P[s, s], work.lower[c], work.upper[c])
+            else:
+                log_mass += truncate_(
+                    n, left_x, left_P, s, work.lower[c], work.upper[c], floor
+                )
+    return log_mass
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -160,25 +162,25 @@ def update_mode_(
     bank: Any,
     work: Any,
     j: int,
+    x: FloatArray,
+    P: FloatArray,
     z: FloatArray,
     r: FloatArray,
     valid: Any,
     age: float,
 ) -> float:  # pragma: no cover - compiled
-    """Constraint and measurement update of Gaussian mode j in work.x[j], work.P[j]; its log L."""
-    x = work.x[j]
-    P = work.P[j]
+    """Constraint and measurement update of Gaussian mode j in x (n,), P (n, n); its log L."""
     log_l = constrain_soft_(n, bank, j, x, P, work)
     n_bounds = bank.n_bounds[j]
     # The lane is that of the prior, for the posterior too.
-    intervals_(bank, j, x, False, work)
+    intervals_(n, bank, j, x, False, work)
     empty = False
     for c in range(n_bounds):
         empty = empty or not work.lower[c] < work.upper[c]
     prior = 0.0
     if not empty:
         prior = mass_(n, x, P, n_bounds, bank.bound_state[j], bank.var_floor, work)
-    log_l += correct_(n, x, P, z, r, valid, age, work.angle, work.h, work.row)
+    log_l += correct_(n, x, P, z, r, valid, age, work.angle)
     if empty or prior < LOG_MASS_FLOOR + 1.0:
         return LOG_FLOOR  # the constraint contradicts the past beyond what numbers can tell
     posterior = 0.0
@@ -186,17 +188,17 @@ def update_mode_(
         # The mass needs the Gaussian before it is projected.
         posterior = mass_(n, x, P, n_bounds, bank.bound_state[j], bank.var_floor, work)
     for c in range(n_bounds):
-        s = bank.bound_state[j, c]
         lower = work.lower[c]
         upper = work.upper[c]
         if lower == -np.inf and upper == np.inf:
             continue  # one interval with another row
-        if not bank.is_projected[j]:
-            posterior += truncate_(n, x, P, s, lower, upper, bank.var_floor, work.row)
-        elif x[s] < lower:
-            project_(n, x, P, s, lower, bank.var_floor, work.row)
-        elif x[s] > upper:
-            project_(n, x, P, s, upper, bank.var_floor, work.row)
+        for s in range(n):
+            if s != bank.bound_state[j, c]:
+                continue
+            if not bank.is_projected[j]:
+                posterior += truncate_(n, x, P, s, lower, upper, bank.var_floor)
+            elif x[s] < lower or x[s] > upper:
+                project_(n, x, P, s, lower if x[s] < lower else upper, bank.var_floor)
     return log_l + posterior - prior
 
 
