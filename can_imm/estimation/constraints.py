@@ -141,7 +141,7 @@ def normal_probability(lower: float, upper: float) -> float:  # pragma: no cover
 def interval_mass(
     mean: float, p: float, lower: float, upper: float
 ) -> float:  # pragma: no cover - compiled
-    """What `truncate_` would return for a state of this mean and variance."""
+    """The log mass of `truncated` alone."""
     if not (p > 0.0 and p < np.inf):
         return np.nan
     sd = math.sqrt(p)
@@ -149,47 +149,69 @@ def interval_mass(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
-def truncate_(
-    n: int,
-    x: FloatArray,
-    P: FloatArray,
-    i0: int,
-    lower: float,
-    upper: float,
-    floor: float,
-) -> float:  # pragma: no cover - compiled
-    """Restrict state ``i0`` to [lower, upper]: exact truncated moments, in place.
+def truncated(
+    mean: float, p: float, lower: float, upper: float, floor: float
+) -> tuple[float, float, float]:  # pragma: no cover - compiled
+    """Log mass, mean and variance of N(mean, p) restricted to [lower, upper].
 
-    The other states follow by their regression on state ``i0`` (Simon 2006, section 7.5.4).
+    The log mass is clipped at `LOG_MASS_FLOOR`, the variance at ``floor``; if p is not positive and
+    finite, the log mass is NaN and the moments are those given.
+    """
+    if not (p > 0.0 and p < np.inf):
+        return np.nan, mean, p
+    sd = math.sqrt(p)
+    log_mass, shift, share = truncated_normal((lower - mean) / sd, (upper - mean) / sd)
+    return log_mass, mean + shift * sd, p * min(max(share, floor / p), 1.0)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def set_marginal_(
+    n: int, x: FloatArray, P: FloatArray, i0: int, mean: float, variance: float
+) -> None:  # pragma: no cover - compiled
+    """Give state ``i0`` another mean and variance, in place.
+
+    The other states follow by their regression on it (Simon 2006, section 7.5.4).
 
     Args:
         n: number of states; the arrays may be larger, what lies beyond is left alone.
-        x: (n,) mean.  P: (n, n) covariance.
+        x: (n,) mean.  P: (n, n) covariance; P[i0, i0] must be positive and finite.
+    """
+    slope = stack_vector(MAX_STATES)
+    shift = mean - x[i0]
+    change = variance - P[i0, i0]
+    scale = 1.0 / P[i0, i0]
+    for i in range(n):
+        slope[i] = P[i, i0] * scale
+        x[i] += slope[i] * shift
+    for i in range(n):
+        for j in range(i + 1):
+            v = P[i, j] + slope[i] * slope[j] * change
+            P[i, j] = v
+            P[j, i] = v
+    for i in range(n):
+        P[i, i0] = slope[i] * variance
+        P[i0, i] = slope[i] * variance
+    x[i0] = mean
+    P[i0, i0] = variance
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def truncate_(
+    n: int, x: FloatArray, P: FloatArray, i0: int, lower: float, upper: float, floor: float
+) -> float:  # pragma: no cover - compiled
+    """Restrict state ``i0`` to [lower, upper]: exact truncated moments, in place.
+
+    Args:
+        n, x, P: as for `set_marginal_`.
         floor: smallest variance that is left to state ``i0``.
 
     Returns:
         Log of the mass that the Gaussian had inside, clipped at `LOG_MASS_FLOOR`; NaN (and x, P
         untouched) if the state's variance is not positive or not finite.
     """
-    slope = stack_vector(MAX_STATES)
-    p = P[i0, i0]
-    if not (p > 0.0 and p < np.inf):
-        return np.nan
-    sd = math.sqrt(p)
-    low, high = (lower - x[i0]) / sd, (upper - x[i0]) / sd
-    if low < -FAR and high > FAR:
-        return 0.0
-    log_mass, mean, variance = truncated_normal(low, high)
-    variance = min(max(variance, floor / p), 1.0)
-    for i in range(n):
-        slope[i] = P[i, i0] / p
-        x[i] += slope[i] * mean * sd
-    shrink = p * (variance - 1.0)
-    for i in range(n):
-        for j in range(i + 1):
-            v = P[i, j] + slope[i] * slope[j] * shrink
-            P[i, j] = v
-            P[j, i] = v
+    log_mass, mean, variance = truncated(x[i0], P[i0, i0], lower, upper, floor)
+    if log_mass < 0.0:
+        set_marginal_(n, x, P, i0, mean, variance)
     return log_mass
 
 
@@ -205,23 +227,8 @@ def project_(
     Returns:
         False (and x, P untouched) if the state's variance is not positive or not finite.
     """
-    slope = stack_vector(MAX_STATES)
-    p = P[i0, i0]
-    if not (p > 0.0 and p < np.inf):
+    if not (P[i0, i0] > 0.0 and P[i0, i0] < np.inf):
         return False
-    e = x[i0] - d
-    for i in range(n):
-        slope[i] = P[i, i0] / p
-    for i in range(n):
-        x[i] -= slope[i] * e
-    for i in range(n):
-        for j in range(i + 1):
-            v = P[i, j] - slope[i] * p * slope[j]
-            P[i, j] = v
-            P[j, i] = v
-    x[i0] = d
-    for i in range(n):
-        P[i, i0] = 0.0
-        P[i0, i] = 0.0
+    set_marginal_(n, x, P, i0, d, 0.0)
     P[i0, i0] = floor
     return True

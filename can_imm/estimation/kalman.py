@@ -20,6 +20,8 @@ from can_imm.estimation.stack import stack_matrix, stack_vector
 from can_imm.types import MAX_STATES, FloatArray
 
 LOG_2PI = math.log(2.0 * math.pi)
+HUGE = 1e300
+"""What is larger is a numeric failure (to compare with infinity takes the compiler far longer)."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -94,7 +96,7 @@ def update_row_(
                 Ph[i] += P[i, k] * h[k]
     for i in range(n):
         s += h[i] * Ph[i]
-    if not (s > 0.0 and s < np.inf and abs(e) < np.inf):
+    if not (0.0 < s < HUGE and abs(e) < HUGE):
         return e, np.nan
     g = 1.0 / s
     for i in range(n):
@@ -119,7 +121,7 @@ def update_state_(
     column, gain = stack_vector(MAX_STATES), stack_vector(MAX_STATES)
     s = P[i0, i0] + r
     e = z - x[i0]
-    if not (s > 0.0 and s < np.inf and abs(e) < np.inf):
+    if not (0.0 < s < HUGE and abs(e) < HUGE):
         return e, np.nan
     g = 1.0 / s
     for i in range(n):

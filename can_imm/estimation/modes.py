@@ -20,7 +20,8 @@ from can_imm.estimation.constraints import (
     interval_mass,
     normal_probability,
     project_,
-    truncate_,
+    set_marginal_,
+    truncated,
 )
 from can_imm.estimation.interaction import intervals_, reference
 from can_imm.estimation.kalman import LOG_2PI, update_row_, update_state_
@@ -36,7 +37,7 @@ from can_imm.estimation.particles import (
     resample_,
     weigh_,
 )
-from can_imm.estimation.stack import element, stack_matrix, stack_vector
+from can_imm.estimation.stack import diagonal, element, stack_matrix, stack_vector
 from can_imm.types import AX, MAX_STATES, VX, VY, FloatArray, Y
 
 
@@ -129,6 +130,21 @@ def correct_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def restrict_(
+    n: int, x: FloatArray, P: FloatArray, state: int, lower: float, upper: float, floor: float
+) -> float:  # pragma: no cover - compiled
+    """`constraints.truncate_` for a state that is not a constant, see `stack`."""
+    log_mass, mean, variance = truncated(
+        element(n, x, state), diagonal(n, P, state), lower, upper, floor
+    )
+    if log_mass < 0.0:
+        for s in range(n):
+            if s == state:
+                set_marginal_(n, x, P, s, mean, variance)
+    return log_mass
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def mass_(
     n: int, x: FloatArray, P: FloatArray, n_bounds: int, state: Any, floor: float, work: Any
 ) -> float:  # pragma: no cover - compiled
@@ -137,23 +153,20 @@ def mass_(
     Args:
         state: (n_bounds,) the bounded states; their intervals are in work.lower and work.upper.
     """
+    if n_bounds == 0:
+        return 0.0
     left_x, left_P = stack_vector(MAX_STATES), stack_matrix(MAX_STATES, MAX_STATES)
     for s in range(n):
         left_x[s] = x[s]
         for t in range(n):
             left_P[s, t] = P[s, t]
     log_mass = 0.0
-    for c in range(n_bounds):
-        for s in range(n):
-            if s != state[c]:
-                continue
-            if c == n_bounds - 1:  # nobody needs the moments
-                log_mass += interval_mass(left_x[s], left_P[s, s], work.lower[c], work.upper[c])
-            else:
-                log_mass += truncate_(
-                    n, left_x, left_P, s, work.lower[c], work.upper[c], floor
-                )
-    return log_mass
+    last = n_bounds - 1
+    for c in range(last):
+        log_mass += restrict_(n, left_x, left_P, state[c], work.lower[c], work.upper[c], floor)
+    # nobody needs the moments of the last one
+    mean, p = element(n, left_x, state[last]), diagonal(n, left_P, state[last])
+    return log_mass + interval_mass(mean, p, work.lower[last], work.upper[last])
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -192,13 +205,15 @@ def update_mode_(
         upper = work.upper[c]
         if lower == -np.inf and upper == np.inf:
             continue  # one interval with another row
-        for s in range(n):
-            if s != bank.bound_state[j, c]:
-                continue
-            if not bank.is_projected[j]:
-                posterior += truncate_(n, x, P, s, lower, upper, bank.var_floor)
-            elif x[s] < lower or x[s] > upper:
-                project_(n, x, P, s, lower if x[s] < lower else upper, bank.var_floor)
+        state = bank.bound_state[j, c]
+        if not bank.is_projected[j]:
+            posterior += restrict_(n, x, P, state, lower, upper, bank.var_floor)
+            continue
+        mean = element(n, x, state)
+        if mean < lower or mean > upper:
+            for s in range(n):
+                if s == state:
+                    project_(n, x, P, s, lower if mean < lower else upper, bank.var_floor)
     return log_l + posterior - prior
 
 

@@ -61,11 +61,24 @@ stack_matrix: Any = intrinsic(_matrix)
 """``stack_matrix(rows, columns)``: an array (rows, columns), both constants."""
 
 
+# Read in any case: out of branches the compiler would make a variable index again.
+
+
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def element(n: int, x: FloatArray, i: int) -> float:  # pragma: no cover - compiled
     """x[i] of x (n,), by constant indices."""
-    v: float = x[0]
+    value: float = x[0]
     for s in range(1, n):
-        if s == i:
-            v = x[s]
-    return v
+        other = x[s]
+        value = other if s == i else value
+    return value
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def diagonal(n: int, P: FloatArray, i: int) -> float:  # pragma: no cover - compiled
+    """P[i, i] of P (n, n), by constant indices."""
+    value: float = P[0, 0]
+    for s in range(1, n):
+        other = P[s, s]
+        value = other if s == i else value
+    return value
