@@ -133,6 +133,8 @@ def normal_probability(lower: float, upper: float) -> float:  # pragma: no cover
         a, b = -upper, -lower
     if a < -FAR:
         return 1.0
+    if a > FAR:
+        return 0.0
     p = 0.5 * math.erfc(a / SQRT_2)
     return p - 0.5 * math.erfc(b / SQRT_2) if b * b - a * a < FURTHER else p
 

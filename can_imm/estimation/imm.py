@@ -26,6 +26,7 @@ from can_imm.estimation.layout import (
 from can_imm.estimation.modes import (
     keep_combined_,
     particle_limit,
+    region_limit,
     update_mode_,
     update_particles_,
 )
@@ -75,25 +76,22 @@ def combine_(n: int, bank: Any, obj: Any, work: Any) -> None:  # pragma: no cove
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def normalise_(
-    n: int, mu: FloatArray, log_l: FloatArray, c: FloatArray, floor: float
+    n: int, mu: FloatArray, log_l: FloatArray, log_c: FloatArray, floor: float
 ) -> bool:  # pragma: no cover - compiled
-    """mu_j proportional to exp(log_l_j) c_j with the log-sum-exp shift, then the floor.
-
-    ``c`` is used up.
+    """mu_j proportional to exp(log_l_j + log_c_j) with the log-sum-exp shift, then the floor.
 
     Returns:
         False if no mode has a finite likelihood (mu untouched).
     """
     top = -np.inf
     for j in range(n):
-        c[j] = log_l[j] + (math.log(c[j]) if c[j] > 0.0 else LOG_FLOOR)
-        if c[j] > top:
-            top = c[j]
+        top = max(top, log_l[j] + log_c[j])
     if not (top > LOG_FLOOR / 2 and top < np.inf):
         return False
     s = 0.0
     for j in range(n):
-        mu[j] = math.exp(c[j] - top) if c[j] > LOG_FLOOR / 2 else 0.0
+        log_mu = log_l[j] + log_c[j]
+        mu[j] = math.exp(log_mu - top) if log_mu > LOG_FLOOR / 2 else 0.0
         s += mu[j]
     t = 0.0
     for j in range(n):
@@ -269,10 +267,10 @@ def cycle_(
     for k in range(n_modes):
         j = work.order[k]
         c = work.c[j]
+        log_c = math.log(c) if c > UNREACHABLE else LOG_FLOOR
+        work.log_c[j] = log_c
         log_l = LOG_FLOOR
-        if c < UNREACHABLE:
-            work.c[j] = 0.0
-        elif math.log(c) + peak > best + worth:
+        if log_c + peak + region_limit(bank, work, j, z, r, valid, age) > best + worth:
             for i in range(n_modes):
                 p = obj.Pi[i, j] * work.mu[i]
                 work.w[i] = p / c if p > NEGLIGIBLE_WEIGHT * c else 0.0
@@ -281,9 +279,9 @@ def cycle_(
                 predict_(n, x, P, bank.F[m, j], bank.Q[m, j])
                 log_l = update_mode_(n, bank, work, j, x, P, z, r, valid, age)
                 put_(n, x, P, work.x[j], work.P[j])
-                best = max(best, math.log(c) + log_l)
+                best = max(best, log_c + log_l)
             elif (
-                math.log(c) + peak + particle_limit(bank, obj, work, j, m, z, r, valid, age)
+                log_c + peak + particle_limit(bank, obj, work, j, m, z, r, valid, age)
                 > best + worth
             ):
                 log_l = update_particles_(
@@ -294,7 +292,7 @@ def cycle_(
             keep_combined_(n, obj, work.x[j], work.P[j])
             log_l = LOG_FLOOR
         obj.log_l[j] = log_l
-    if not normalise_(n_modes, obj.mu, obj.log_l, work.c, bank.mu_floor):
+    if not normalise_(n_modes, obj.mu, obj.log_l, work.log_c, bank.mu_floor):
         return FAILED
     for j in range(n_modes):
         put_(n, work.x[j], work.P[j], obj.x[j], obj.P[j])
@@ -332,7 +330,7 @@ def birth_(
             if bank.entry_var[j, s] >= 0.0:
                 x[s] = bank.entry_mean[j, s]
                 P[s, s] = bank.entry_var[j, s]
-        work.c[j] = bank.mu0[j]
+        log_c = math.log(bank.mu0[j])
         for c in range(bank.n_bounds[j]):
             s = bank.bound_state[j, c]
             # Of a speed that is not measured the prior says enough to tell what stands still.
@@ -342,19 +340,18 @@ def birth_(
                 v = z[s] if s % 2 == 1 and valid[s] else x[s]
                 base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work, v)
                 sd = math.sqrt(r[s]) if valid[s] else bank.birth_std[s]
-                work.c[j] *= math.exp(
-                    normal_mass(
-                        (base + bank.bound_lower[j, c] - v) / sd,
-                        (base + bank.bound_upper[j, c] - v) / sd,
-                    )
+                log_c += normal_mass(
+                    (base + bank.bound_lower[j, c] - v) / sd,
+                    (base + bank.bound_upper[j, c] - v) / sd,
                 )
+        work.log_c[j] = log_c
         log_l = update_mode_(n, bank, work, j, x, P, z, r, valid, age)
         put_(n, x, P, work.x[j], work.P[j])
         if bank.is_particle[j]:
             log_l = LOG_FLOOR  # entered from another mode, never born into
         obj.log_l[j] = log_l if log_l > LOG_FLOOR else LOG_FLOOR
         obj.mu[j] = bank.mu0[j]
-    if not normalise_(n_modes, obj.mu, obj.log_l, work.c, bank.mu_floor):
+    if not normalise_(n_modes, obj.mu, obj.log_l, work.log_c, bank.mu_floor):
         return FAILED
     for j in range(n_modes):
         put_(n, work.x[j], work.P[j], obj.x[j], obj.P[j])

@@ -25,7 +25,7 @@ from can_imm.estimation.constraints import (
 )
 from can_imm.estimation.interaction import intervals_, reference
 from can_imm.estimation.kalman import LOG_2PI, update_row_, update_state_
-from can_imm.estimation.layout import LOG_FLOOR
+from can_imm.estimation.layout import LANE, LOG_FLOOR
 from can_imm.estimation.noise import NoiseState, load, store_, uniform
 from can_imm.estimation.particles import (
     N_COLUMNS,
@@ -39,6 +39,9 @@ from can_imm.estimation.particles import (
 )
 from can_imm.estimation.stack import diagonal, element, stack_matrix, stack_vector
 from can_imm.types import AX, MAX_STATES, VX, VY, FloatArray, Y
+
+FASTEST, SWIFTEST = 100.0, 20.0
+"""No object is faster [m/s], or changes its speed faster [m/s^2], while a measurement ages."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -226,6 +229,30 @@ def keep_combined_(
         x[s] = obj.mean[s]
         for t in range(n):
             P[s, t] = obj.cov[s, t]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def region_limit(
+    bank: Any, work: Any, j: int, z: FloatArray, r: FloatArray, valid: Any, age: float
+) -> float:  # pragma: no cover - compiled
+    """Log of a bound on what mode j can say of z, over the peak density of the measurement.
+
+    Its states lie within its bounds, so that z is no likelier than seen from the nearest point
+    there.  Bounds that go with a lane, and axes that are turned, are not looked at.
+    """
+    limit = 0.0
+    if work.angle != 0.0:
+        return limit
+    for c in range(bank.n_bounds[j]):
+        s = bank.bound_state[j, c]
+        if s >= 4 or not valid[s] or bank.bound_kind[j, c] == LANE:
+            continue
+        base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work, 0.0)
+        outside = max(base + bank.bound_lower[j, c] - z[s], z[s] - base - bank.bound_upper[j, c])
+        outside -= age * (SWIFTEST if s % 2 else FASTEST)
+        if outside > 0.0:
+            limit = min(limit, -0.5 * outside * outside / r[s])
+    return limit
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
