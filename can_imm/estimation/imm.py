@@ -391,7 +391,7 @@ def extrapolate_(
                 )
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def process_scan_(
     bank: Any,
     objects: Any,
