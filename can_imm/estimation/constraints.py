@@ -125,18 +125,22 @@ def normal_mass(lower: float, upper: float) -> float:  # pragma: no cover - comp
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
-def normal_probability(lower: float, upper: float) -> float:  # pragma: no cover - compiled
-    """Probability of [lower, upper] under a standard normal, right to 1e-16 (not relatively)."""
-    if lower > -np.inf and (upper == np.inf or lower + upper > 0.0):
-        a, b = lower, upper
-    else:
-        a, b = -upper, -lower
-    if a < -FAR:
+def interval_probability(
+    mean: float, variance: float, lower: float, upper: float
+) -> float:  # pragma: no cover - compiled
+    """Probability of [lower, upper] under N(mean, variance), right to 1e-16 (not relatively)."""
+    below, above = mean - lower, upper - mean
+    # what is far needs no root
+    far = FAR * FAR * variance
+    if below > 0.0 and above > 0.0 and below * below > far and above * above > far:
         return 1.0
-    if a > FAR:
+    if (below < 0.0 and below * below > far) or (above < 0.0 and above * above > far):
         return 0.0
-    p = 0.5 * math.erfc(a / SQRT_2)
-    return p - 0.5 * math.erfc(b / SQRT_2) if b * b - a * a < FURTHER else p
+    scale = 1.0 / (SQRT_2 * math.sqrt(variance))
+    # the nearer bound, to the right of the mean or the interval covers it, and the further one
+    a, b = (-below, above) if above > below else (-above, below)
+    p = 0.5 * math.erfc(a * scale)
+    return p - 0.5 * math.erfc(b * scale) if b * b - a * a < FURTHER * variance else p
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)

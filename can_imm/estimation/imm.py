@@ -46,10 +46,10 @@ def present_(bank: Any, obj: Any, w: FloatArray) -> None:  # pragma: no cover - 
     """
     total = 0.0
     for j in range(bank.n_modes):
-        w[j] = obj.mu[j] if obj.mu[j] > 2.0 * bank.mu_floor else 0.0
-        total += w[j]
+        if obj.mu[j] > 2.0 * bank.mu_floor:
+            total += obj.mu[j]
     for j in range(bank.n_modes):
-        w[j] /= total
+        w[j] = obj.mu[j] / total if obj.mu[j] > 2.0 * bank.mu_floor else 0.0
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from can_imm.estimation.constraints import normal_probability
+from can_imm.estimation.constraints import interval_probability
 from can_imm.estimation.layout import FIXED, GROUND, SPEED_STEP
 from can_imm.estimation.stack import element, stack_matrix, stack_vector
 from can_imm.types import MAX_STATES, VX, FloatArray, X
@@ -136,7 +136,7 @@ def transitions_(
                             for t in range(n):
                                 q += f * bank.F[m, i, s, t] * obj.P[i, k, t]
                     work.tx[s] = v
-                    work.var[s] = 1.0 / math.sqrt(max(q, bank.var_floor))
+                    work.var[s] = max(q, bank.var_floor)
             intervals_(n, bank, j, work.tx, True, work)
             for c in range(bank.n_bounds[j]):
                 s = bank.bound_state[j, c]
@@ -146,9 +146,8 @@ def transitions_(
                     p = 0.0
                     break
                 if work.lower[c] > -np.inf or work.upper[c] < np.inf:
-                    p *= normal_probability(
-                        (work.lower[c] - work.tx[s]) * work.var[s],
-                        (work.upper[c] - work.tx[s]) * work.var[s],
+                    p *= interval_probability(
+                        work.tx[s], work.var[s], work.lower[c], work.upper[c]
                     )
             obj.Pi[i, j] = p
             total += p

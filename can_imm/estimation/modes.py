@@ -18,7 +18,7 @@ import numpy as np
 from can_imm.estimation.constraints import (
     LOG_MASS_FLOOR,
     interval_mass,
-    normal_probability,
+    interval_probability,
     project_,
     set_marginal_,
     truncated,
@@ -300,8 +300,8 @@ def particle_limit(
             y += gain * e
             yy -= gain * gain * s
             p = math.exp(-0.5 * e * e / s) * math.sqrt(r[Y] / s)
-        sd = math.sqrt(max(yy, bank.var_floor))
-        share += work.w[i] * p * normal_probability((par.y_low - y) / sd, (par.y_high - y) / sd)
+        yy = max(yy, bank.var_floor)
+        share += work.w[i] * p * interval_probability(y, yy, par.y_low, par.y_high)
     return limit + math.log(share)
 
 
