@@ -130,7 +130,8 @@ def update_state_(
         x[i] += gain[i] * e
     for i in range(n):
         for j in range(i + 1):
-            v = P[i, j] - gain[i] * column[j]
+            # in this order no more than two operations wait for the division
+            v = P[i, j] - column[i] * column[j] * g
             P[i, j] = v
             P[j, i] = v
     for i in range(n):

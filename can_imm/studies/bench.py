@@ -223,7 +223,7 @@ class Estimator:
         process, address, n, z = self._processor.run, self._processor.address, self._n, self._z
         self._steps[:] = -1
         for k, row in enumerate(self.scans):
-            z[:] = row
+            z[...] = row
             process(address, n, layout.UNKNOWN_GROUND, 0.0, 0.0)
             if k == 0:
                 self._steps[:] = STEPS
