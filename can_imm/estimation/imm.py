@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from can_imm.estimation.constraints import normal_mass
-from can_imm.estimation.interaction import blend_, mix_, nearest_lane, reference, transitions_
+from can_imm.estimation.interaction import mix_, nearest_lane, reference, transitions_
 from can_imm.estimation.kalman import predict_
 from can_imm.estimation.layout import (
     GROUND,
@@ -58,15 +58,21 @@ def combine_(n: int, bank: Any, obj: Any, work: Any) -> None:  # pragma: no cove
     n_modes = bank.n_modes
     present_(bank, obj, work.w)
     mean, cov = stack_vector(MAX_STATES), stack_matrix(MAX_STATES, MAX_STATES)
+    d = stack_vector(MAX_STATES)
     for s in range(n):
         mean[s] = 0.0
         for t in range(s + 1):
             cov[s, t] = 0.0
-    total = 0.0
     for j in range(n_modes):
         if work.w[j] > 0.0:
-            total += work.w[j]
-            blend_(n, work.w[j], total, obj.x[j], obj.P[j], mean, cov)
+            for s in range(n):
+                mean[s] += work.w[j] * obj.x[j, s]
+    for j in range(n_modes):
+        if work.w[j] > 0.0:
+            for s in range(n):
+                d[s] = obj.x[j, s] - mean[s]
+                for t in range(s + 1):
+                    cov[s, t] += work.w[j] * (obj.P[j, s, t] + d[s] * d[t])
     for s in range(n):
         obj.mean[s] = mean[s]
         for t in range(s + 1):

@@ -15,27 +15,6 @@ from can_imm.types import MAX_STATES, VX, FloatArray, X
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
-def blend_(
-    n: int, w: float, total: float, m: FloatArray, A: FloatArray, x: FloatArray, P: FloatArray
-) -> None:  # pragma: no cover - compiled
-    """Add N(m, A) with weight ``w`` to the mixture of mean x (n,) and covariance P (n, n).
-
-    Its weights must sum to 1 in the end (West 1979).  Of A and P only the lower halves count.
-
-    Args:
-        total: of the weights so far, with this one; with the first one, x and P must be 0.
-    """
-    share = w / total
-    spread = w - share * w
-    d = stack_vector(MAX_STATES)
-    for s in range(n):
-        d[s] = m[s] - x[s]
-        x[s] += share * d[s]
-        for t in range(s + 1):
-            P[s, t] += w * A[s, t] + spread * (d[s] * d[t])
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def enter_(
     n: int, bank: Any, obj: Any, i: int, j: int, tau: float, m: FloatArray, A: FloatArray
 ) -> None:  # pragma: no cover - compiled
@@ -83,17 +62,24 @@ def mix_(
     """
     tau = m * bank.step_s
     from_x, from_P = stack_vector(MAX_STATES), stack_matrix(MAX_STATES, MAX_STATES)
+    d = stack_vector(MAX_STATES)
     for s in range(n):
         x[s] = 0.0
         for t in range(s + 1):
             P[s, t] = 0.0
-    total = 0.0
     for i in range(bank.n_modes):
-        w = work.w[i]
-        if w > 0.0:
-            total += w
+        if work.w[i] > 0.0:
+            # covariances are of no use here, and the compiler leaves them out
             enter_(n, bank, obj, i, j, tau, from_x, from_P)
-            blend_(n, w, total, from_x, from_P, x, P)
+            for s in range(n):
+                x[s] += work.w[i] * from_x[s]
+    for i in range(bank.n_modes):
+        if work.w[i] > 0.0:
+            enter_(n, bank, obj, i, j, tau, from_x, from_P)
+            for s in range(n):
+                d[s] = from_x[s] - x[s]
+                for t in range(s + 1):
+                    P[s, t] += work.w[i] * (from_P[s, t] + d[s] * d[t])
     for s in range(n):
         for t in range(s):
             P[t, s] = P[s, t]

@@ -24,10 +24,10 @@ def log_likelihood(bank, x, P, z, r, valid=VALID_2, age=0.0, lane_width=3.0):
     """Of mode 0 by the kernel; also the updated mean and covariance."""
     n = int(bank[0]["n_states"])
     work = np.zeros(1, layout.WORK_DTYPE)
-    work[0]["x"][0, :n], work[0]["P"][0, :n, :n] = x, P
     work[0]["lane_width"] = lane_width
-    log_l = imm.update_mode_(bank[0]["n_states"], bank[0], work[0], 0, z, r, valid, age)
-    return log_l, work[0]["x"][0, :n], work[0]["P"][0, :n, :n]
+    x, P = x.copy(), P.copy()
+    log_l = imm.update_mode_(n, bank[0], work[0], 0, x, P, z, r, valid, age)
+    return log_l, x, P
 
 
 def soft_factor(rows: list[tuple[int, float, float]]) -> Callable[[np.ndarray], np.ndarray]:
