@@ -270,6 +270,22 @@ def test_an_outlier_without_a_gate_does_not_reset_the_probabilities() -> None:
     assert not np.allclose(mu, before)
 
 
+def test_a_mode_that_its_bounds_rule_out_is_not_computed() -> None:
+    """It gets the floor, as it would otherwise, and its state is that of the others."""
+    bank, scans = objects_and_scans(4)
+    runner = Runner(bank, 1)
+    runner.scan([0], [-1], scans[0][0], R)
+    obj = runner.objects[0]
+    for near in (True, False):
+        z = scans[1][0].copy()
+        z[3] = 0.3 if near else -4.0  # mode 1 is one of vy > 0.2
+        before = obj["mean"].copy()
+        assert runner.scan([0], [10], z, 0.02)[0] == imm.OK
+        assert (obj["log_l"][1] > layout.LOG_FLOOR) == near
+    assert obj["mu"][1] == pytest.approx(1e-6, rel=1e-3)
+    np.testing.assert_array_equal(obj["x"][1], before)
+
+
 def test_a_mode_without_probability_stays_finite_and_can_come_back() -> None:
     """Nothing leads to mode 1 for a while; filterpy makes this a NaN."""
     bank = blank(2, 4)
