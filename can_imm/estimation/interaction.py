@@ -132,9 +132,7 @@ def transitions_(
                     p = 0.0
                     break
                 if work.lower[c] > -np.inf or work.upper[c] < np.inf:
-                    p *= interval_probability(
-                        work.tx[s], work.var[s], work.lower[c], work.upper[c]
-                    )
+                    p *= interval_probability(work.tx[s], work.var[s], work.lower[c], work.upper[c])
             obj.Pi[i, j] = p
             total += p
         if total > 1e-30:

@@ -12,7 +12,6 @@ from typing import Any
 import numba
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 from can_imm.types import FloatArray
@@ -31,7 +30,8 @@ def _on_stack(shape: tuple[Any, ...]) -> Any:
         for length in lengths[:0:-1]:
             strides.insert(0, strides[0] * length)
         memory = ir.ArrayType(ir.DoubleType(), strides[0] * lengths[0] // 8)
-        pointer = cgutils.alloca_once(builder, memory)
+        with builder.goto_entry_block():
+            pointer = builder.alloca(memory)
         view = context.make_array(array)(context, builder)
         context.populate_array(
             view,
