@@ -11,7 +11,7 @@ import math
 import numba
 import numpy as np
 
-from can_imm.estimation.stack import stack_vector
+from can_imm.estimation.stack import diagonal, element, stack_vector
 from can_imm.types import MAX_STATES, FloatArray
 
 SQRT_2 = math.sqrt(2.0)
@@ -215,9 +215,11 @@ def truncate_(
         Log of the mass that the Gaussian had inside, clipped at `LOG_MASS_FLOOR`; NaN (and x, P
         untouched) if the state's variance is not positive or not finite.
     """
-    log_mass, mean, variance = truncated(x[i0], P[i0, i0], lower, upper, floor)
+    log_mass, mean, variance = truncated(element(n, x, i0), diagonal(n, P, i0), lower, upper, floor)
     if log_mass < 0.0:
-        set_marginal_(n, x, P, i0, mean, variance)
+        for s in range(n):
+            if s == i0:  # a constant in each branch, see `stack`
+                set_marginal_(n, x, P, s, mean, variance)
     return log_mass
 
 
@@ -233,8 +235,11 @@ def project_(
     Returns:
         False (and x, P untouched) if the state's variance is not positive or not finite.
     """
-    if not (P[i0, i0] > 0.0 and P[i0, i0] < np.inf):
+    p = diagonal(n, P, i0)
+    if not (p > 0.0 and p < np.inf):
         return False
-    set_marginal_(n, x, P, i0, d, 0.0)
-    P[i0, i0] = floor
+    for s in range(n):
+        if s == i0:
+            set_marginal_(n, x, P, s, d, 0.0)
+            P[s, s] = floor
     return True

@@ -273,10 +273,12 @@ def cycle_(
     for k in range(n_modes):
         j = work.order[k]
         c = work.c[j]
-        log_c = math.log(c) if c > UNREACHABLE else LOG_FLOOR
+        reachable = c >= UNREACHABLE
+        log_c = math.log(c) if reachable else LOG_FLOOR
         work.log_c[j] = log_c
         log_l = LOG_FLOOR
-        if log_c + peak + region_limit(bank, work, j, z, r, valid, age) > best + worth:
+        limit = log_c + peak + region_limit(bank, work, j, z, r, valid, age)
+        if reachable and limit > best + worth:
             for i in range(n_modes):
                 p = obj.Pi[i, j] * work.mu[i]
                 work.w[i] = p / c if p > NEGLIGIBLE_WEIGHT * c else 0.0
@@ -286,10 +288,7 @@ def cycle_(
                 log_l = update_mode_(n, bank, work, j, x, P, z, r, valid, age)
                 put_(n, x, P, work.x[j], work.P[j])
                 best = max(best, log_c + log_l)
-            elif (
-                log_c + peak + particle_limit(bank, obj, work, j, m, z, r, valid, age)
-                > best + worth
-            ):
+            elif limit + particle_limit(bank, obj, work, j, m, z, r, valid, age) > best + worth:
                 log_l = update_particles_(
                     bank, obj, work, j, m, z, r, valid, age, particles, spare, weights, noise
                 )
@@ -397,6 +396,7 @@ def extrapolate_(
                 )
 
 
+# Within `entry`, which knows its arrays by address alone, nobody counts references to them.
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def process_scan_(
     bank: Any,

@@ -20,8 +20,7 @@ from can_imm.estimation.constraints import (
     interval_mass,
     interval_probability,
     project_,
-    set_marginal_,
-    truncated,
+    truncate_,
 )
 from can_imm.estimation.interaction import intervals_, reference
 from can_imm.estimation.kalman import LOG_2PI, update_row_, update_state_
@@ -40,7 +39,7 @@ from can_imm.estimation.particles import (
 from can_imm.estimation.stack import diagonal, element, stack_matrix, stack_vector
 from can_imm.types import AX, MAX_STATES, VX, VY, FloatArray, Y
 
-FASTEST, SWIFTEST = 100.0, 20.0
+FASTEST, SWIFTEST = 150.0, 20.0
 """No object is faster [m/s], or changes its speed faster [m/s^2], while a measurement ages."""
 
 
@@ -133,21 +132,6 @@ def correct_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
-def restrict_(
-    n: int, x: FloatArray, P: FloatArray, state: int, lower: float, upper: float, floor: float
-) -> float:  # pragma: no cover - compiled
-    """`constraints.truncate_` for a state that is not a constant, see `stack`."""
-    log_mass, mean, variance = truncated(
-        element(n, x, state), diagonal(n, P, state), lower, upper, floor
-    )
-    if log_mass < 0.0:
-        for s in range(n):
-            if s == state:
-                set_marginal_(n, x, P, s, mean, variance)
-    return log_mass
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def mass_(
     n: int, x: FloatArray, P: FloatArray, n_bounds: int, state: Any, floor: float, work: Any
 ) -> float:  # pragma: no cover - compiled
@@ -166,7 +150,7 @@ def mass_(
     log_mass = 0.0
     last = n_bounds - 1
     for c in range(last):
-        log_mass += restrict_(n, left_x, left_P, state[c], work.lower[c], work.upper[c], floor)
+        log_mass += truncate_(n, left_x, left_P, state[c], work.lower[c], work.upper[c], floor)
     # nobody needs the moments of the last one
     mean, p = element(n, left_x, state[last]), diagonal(n, left_P, state[last])
     return log_mass + interval_mass(mean, p, work.lower[last], work.upper[last])
@@ -210,13 +194,11 @@ def update_mode_(
             continue  # one interval with another row
         state = bank.bound_state[j, c]
         if not bank.is_projected[j]:
-            posterior += restrict_(n, x, P, state, lower, upper, bank.var_floor)
+            posterior += truncate_(n, x, P, state, lower, upper, bank.var_floor)
             continue
         mean = element(n, x, state)
         if mean < lower or mean > upper:
-            for s in range(n):
-                if s == state:
-                    project_(n, x, P, s, lower if mean < lower else upper, bank.var_floor)
+            project_(n, x, P, state, lower if mean < lower else upper, bank.var_floor)
     return log_l + posterior - prior
 
 

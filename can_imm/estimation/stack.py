@@ -2,7 +2,8 @@
 
 Results that a kernel writes to scratch from outside have to be in memory: the compiler cannot know
 that nobody reads them, nor that they overlap with nothing that the kernel reads.  Arrays of its own
-it keeps in registers, if every index is a constant once the loops are unrolled.
+it keeps in registers, if every index is a constant once the loops are unrolled.  Hence, where the
+index is a variable, one branch for each of its values: ``for s in range(n): if s == i: ...``.
 """
 
 from __future__ import annotations

@@ -250,7 +250,7 @@ def test_the_limit_is_the_distance_from_the_bounds() -> None:
     assert limit(bank, z, r, all_valid, angle=0.1) == 0.0
     add_bound(bank, 0, 0, -INF, 45.0)
     assert limit(bank, z, r, all_valid) == pytest.approx(-0.5 * 5.0**2 / 0.25)
-    assert limit(bank, z, r, all_valid, age=0.04) == pytest.approx(-0.5 * 2.2**2 / 0.25)
+    assert limit(bank, z, r, all_valid, age=0.02) == pytest.approx(-0.5 * 2.6**2 / 0.25)
     lane = blank(1, 4)
     add_bound(lane, 0, 2, 1.0, 1.5, lanes=(0, 1))
     assert limit(lane, z, r, all_valid) == 0.0
