@@ -15,6 +15,8 @@ import numpy.typing as npt
 X, VX, Y, VY = 0, 1, 2, 3
 """Indices of the four published states; AX and AY follow where a model carries acceleration."""
 AX, AY = 4, 5
+MAX_STATES = 6
+"""Largest number of states."""
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]

@@ -4,8 +4,9 @@
   can-imm bench --log drive.log --profile toyota    replay a log of your own
   can-imm bench --json bench.json                   and write the figures to a file
 
-Peers are filterpy, cantools and python-can.  Each time is a median over rounds in which both sides
-take turns; the ratio of the two depends far less on the machine than the times do.
+Peers are filterpy, cantools and python-can, and Stone Soup where it is installed.  Each time is a
+median over rounds in which both sides take turns; the ratio of the two depends far less on the
+machine than the times do.
 """
 
 from __future__ import annotations

@@ -11,7 +11,8 @@ import math
 import numba
 import numpy as np
 
-from can_imm.types import FloatArray
+from can_imm.estimation.stack import diagonal, element, stack_vector
+from can_imm.types import MAX_STATES, FloatArray
 
 SQRT_2 = math.sqrt(2.0)
 LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
@@ -124,79 +125,107 @@ def normal_mass(lower: float, upper: float) -> float:  # pragma: no cover - comp
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
-def normal_probability(lower: float, upper: float) -> float:  # pragma: no cover - compiled
-    """Probability of [lower, upper] under a standard normal, right to 1e-16 (not relatively)."""
-    if lower > -np.inf and (upper == np.inf or lower + upper > 0.0):
-        a, b = lower, upper
-    else:
-        a, b = -upper, -lower
-    if a < -FAR:
+def interval_probability(
+    mean: float, variance: float, lower: float, upper: float
+) -> float:  # pragma: no cover - compiled
+    """Probability of [lower, upper] under N(mean, variance), right to 1e-16 (not relatively)."""
+    below, above = mean - lower, upper - mean
+    # what is far needs no root
+    far = FAR * FAR * variance
+    if below > 0.0 and above > 0.0 and below * below > far and above * above > far:
         return 1.0
-    p = 0.5 * math.erfc(a / SQRT_2)
-    return p - 0.5 * math.erfc(b / SQRT_2) if b * b - a * a < FURTHER else p
+    if (below < 0.0 and below * below > far) or (above < 0.0 and above * above > far):
+        return 0.0
+    scale = 1.0 / (SQRT_2 * math.sqrt(variance))
+    # the nearer bound, to the right of the mean or the interval covers it, and the further one
+    a, b = (-below, above) if above > below else (-above, below)
+    p = 0.5 * math.erfc(a * scale)
+    return p - 0.5 * math.erfc(b * scale) if b * b - a * a < FURTHER * variance else p
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def interval_mass(
-    x: FloatArray, P: FloatArray, i0: int, lower: float, upper: float
+    mean: float, p: float, lower: float, upper: float
 ) -> float:  # pragma: no cover - compiled
-    """What `truncate_` would return, without its work on the moments."""
-    p = P[i0, i0]
+    """The log mass of `truncated` alone."""
     if not (p > 0.0 and p < np.inf):
         return np.nan
     sd = math.sqrt(p)
-    return normal_mass((lower - x[i0]) / sd, (upper - x[i0]) / sd)
+    return normal_mass((lower - mean) / sd, (upper - mean) / sd)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def truncated(
+    mean: float, p: float, lower: float, upper: float, floor: float
+) -> tuple[float, float, float]:  # pragma: no cover - compiled
+    """Log mass, mean and variance of N(mean, p) restricted to [lower, upper].
+
+    The log mass is clipped at `LOG_MASS_FLOOR`, the variance at ``floor``; if p is not positive and
+    finite, the log mass is NaN and the moments are those given.
+    """
+    if not (p > 0.0 and p < np.inf):
+        return np.nan, mean, p
+    sd = math.sqrt(p)
+    log_mass, shift, share = truncated_normal((lower - mean) / sd, (upper - mean) / sd)
+    return log_mass, mean + shift * sd, p * min(max(share, floor / p), 1.0)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def set_marginal_(
+    n: int, x: FloatArray, P: FloatArray, i0: int, mean: float, variance: float
+) -> None:  # pragma: no cover - compiled
+    """Give state ``i0`` another mean and variance, in place.
+
+    The other states follow by their regression on it (Simon 2006, section 7.5.4).
+
+    Args:
+        n: number of states; the arrays may be larger, what lies beyond is left alone.
+        x: (n,) mean.  P: (n, n) covariance; P[i0, i0] must be positive and finite.
+    """
+    slope = stack_vector(MAX_STATES)
+    shift = mean - x[i0]
+    change = variance - P[i0, i0]
+    scale = 1.0 / P[i0, i0]
+    for i in range(n):
+        slope[i] = P[i, i0] * scale
+        x[i] += slope[i] * shift
+    for i in range(n):
+        for j in range(i + 1):
+            v = P[i, j] + slope[i] * slope[j] * change
+            P[i, j] = v
+            P[j, i] = v
+    for i in range(n):
+        P[i, i0] = slope[i] * variance
+        P[i0, i] = slope[i] * variance
+    x[i0] = mean
+    P[i0, i0] = variance
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def truncate_(
-    n: int,
-    x: FloatArray,
-    P: FloatArray,
-    i0: int,
-    lower: float,
-    upper: float,
-    floor: float,
-    work: FloatArray,
+    n: int, x: FloatArray, P: FloatArray, i0: int, lower: float, upper: float, floor: float
 ) -> float:  # pragma: no cover - compiled
     """Restrict state ``i0`` to [lower, upper]: exact truncated moments, in place.
 
-    The other states follow by their regression on state ``i0`` (Simon 2006, section 7.5.4).
-
     Args:
-        n: number of states; the arrays may be larger, what lies beyond is left alone.
-        x: (n,) mean.  P: (n, n) covariance.
+        n, x, P: as for `set_marginal_`.
         floor: smallest variance that is left to state ``i0``.
-        work: (>= 1, n) scratch.
 
     Returns:
         Log of the mass that the Gaussian had inside, clipped at `LOG_MASS_FLOOR`; NaN (and x, P
         untouched) if the state's variance is not positive or not finite.
     """
-    p = P[i0, i0]
-    if not (p > 0.0 and p < np.inf):
-        return np.nan
-    sd = math.sqrt(p)
-    low, high = (lower - x[i0]) / sd, (upper - x[i0]) / sd
-    if low < -FAR and high > FAR:
-        return 0.0
-    log_mass, mean, variance = truncated_normal(low, high)
-    variance = min(max(variance, floor / p), 1.0)
-    for i in range(n):
-        work[0, i] = P[i, i0] / p
-        x[i] += work[0, i] * mean * sd
-    shrink = p * (variance - 1.0)
-    for i in range(n):
-        for j in range(i + 1):
-            v = P[i, j] + work[0, i] * work[0, j] * shrink
-            P[i, j] = v
-            P[j, i] = v
+    log_mass, mean, variance = truncated(element(n, x, i0), diagonal(n, P, i0), lower, upper, floor)
+    if log_mass < 0.0:
+        for s in range(n):
+            if s == i0:  # a constant in each branch, see `stack`
+                set_marginal_(n, x, P, s, mean, variance)
     return log_mass
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def project_(
-    n: int, x: FloatArray, P: FloatArray, i0: int, d: float, floor: float, work: FloatArray
+    n: int, x: FloatArray, P: FloatArray, i0: int, d: float, floor: float
 ) -> bool:  # pragma: no cover - compiled
     """Project onto the hyperplane x[i0] = d with W = P^-1, in place ((24) to (28), corrected).
 
@@ -206,22 +235,11 @@ def project_(
     Returns:
         False (and x, P untouched) if the state's variance is not positive or not finite.
     """
-    p = P[i0, i0]
+    p = diagonal(n, P, i0)
     if not (p > 0.0 and p < np.inf):
         return False
-    e = x[i0] - d
-    for i in range(n):
-        work[0, i] = P[i, i0] / p
-    for i in range(n):
-        x[i] -= work[0, i] * e
-    for i in range(n):
-        for j in range(i + 1):
-            v = P[i, j] - work[0, i] * p * work[0, j]
-            P[i, j] = v
-            P[j, i] = v
-    x[i0] = d
-    for i in range(n):
-        P[i, i0] = 0.0
-        P[i0, i] = 0.0
-    P[i0, i0] = floor
+    for s in range(n):
+        if s == i0:
+            set_marginal_(n, x, P, s, d, 0.0)
+            P[s, s] = floor
     return True

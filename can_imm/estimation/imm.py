@@ -26,11 +26,13 @@ from can_imm.estimation.layout import (
 from can_imm.estimation.modes import (
     keep_combined_,
     particle_limit,
+    region_limit,
     update_mode_,
     update_particles_,
 )
 from can_imm.estimation.noise import NoiseState
-from can_imm.types import FloatArray
+from can_imm.estimation.stack import stack_matrix, stack_vector
+from can_imm.types import MAX_STATES, FloatArray
 
 TWO_PI = 2.0 * math.pi
 
@@ -44,10 +46,10 @@ def present_(bank: Any, obj: Any, w: FloatArray) -> None:  # pragma: no cover - 
     """
     total = 0.0
     for j in range(bank.n_modes):
-        w[j] = obj.mu[j] if obj.mu[j] > 2.0 * bank.mu_floor else 0.0
-        total += w[j]
+        if obj.mu[j] > 2.0 * bank.mu_floor:
+            total += obj.mu[j]
     for j in range(bank.n_modes):
-        w[j] /= total
+        w[j] = obj.mu[j] / total if obj.mu[j] > 2.0 * bank.mu_floor else 0.0
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -55,44 +57,47 @@ def combine_(n: int, bank: Any, obj: Any, work: Any) -> None:  # pragma: no cove
     """Combined mean and covariance (19)(20) of all modes that are above the floor."""
     n_modes = bank.n_modes
     present_(bank, obj, work.w)
+    mean, cov = stack_vector(MAX_STATES), stack_matrix(MAX_STATES, MAX_STATES)
+    d = stack_vector(MAX_STATES)
     for s in range(n):
-        v = 0.0
-        for j in range(n_modes):
-            v += work.w[j] * obj.x[j, s]
-        obj.mean[s] = v
-    for s in range(n):
+        mean[s] = 0.0
         for t in range(s + 1):
-            v = 0.0
-            for j in range(n_modes):
-                if work.w[j] > 0.0:
-                    v += work.w[j] * (
-                        obj.P[j, s, t] + (obj.x[j, s] - obj.mean[s]) * (obj.x[j, t] - obj.mean[t])
-                    )
-            obj.cov[s, t] = v
-            obj.cov[t, s] = v
+            cov[s, t] = 0.0
+    for j in range(n_modes):
+        if work.w[j] > 0.0:
+            for s in range(n):
+                mean[s] += work.w[j] * obj.x[j, s]
+    for j in range(n_modes):
+        if work.w[j] > 0.0:
+            for s in range(n):
+                d[s] = obj.x[j, s] - mean[s]
+                for t in range(s + 1):
+                    cov[s, t] += work.w[j] * (obj.P[j, s, t] + d[s] * d[t])
+    for s in range(n):
+        obj.mean[s] = mean[s]
+        for t in range(s + 1):
+            obj.cov[s, t] = cov[s, t]
+            obj.cov[t, s] = cov[s, t]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def normalise_(
-    n: int, mu: FloatArray, log_l: FloatArray, c: FloatArray, floor: float
+    n: int, mu: FloatArray, log_l: FloatArray, log_c: FloatArray, floor: float
 ) -> bool:  # pragma: no cover - compiled
-    """mu_j proportional to exp(log_l_j) c_j with the log-sum-exp shift, then the floor.
-
-    ``c`` is used up.
+    """mu_j proportional to exp(log_l_j + log_c_j) with the log-sum-exp shift, then the floor.
 
     Returns:
         False if no mode has a finite likelihood (mu untouched).
     """
     top = -np.inf
     for j in range(n):
-        c[j] = log_l[j] + (math.log(c[j]) if c[j] > 0.0 else LOG_FLOOR)
-        if c[j] > top:
-            top = c[j]
+        top = max(top, log_l[j] + log_c[j])
     if not (top > LOG_FLOOR / 2 and top < np.inf):
         return False
     s = 0.0
     for j in range(n):
-        mu[j] = math.exp(c[j] - top) if c[j] > LOG_FLOOR / 2 else 0.0
+        log_mu = log_l[j] + log_c[j]
+        mu[j] = math.exp(log_mu - top) if log_mu > LOG_FLOOR / 2 else 0.0
         s += mu[j]
     t = 0.0
     for j in range(n):
@@ -101,6 +106,17 @@ def normalise_(
     for j in range(n):
         mu[j] /= t
     return True
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def put_(
+    n: int, x: FloatArray, P: FloatArray, to_x: FloatArray, to_P: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """Copy mean x (n,) and covariance P (n, n)."""
+    for s in range(n):
+        to_x[s] = x[s]
+        for t in range(n):
+            to_P[s, t] = P[s, t]
 
 
 OK, OUTLIER, FAILED = 0, 1, 2
@@ -253,25 +269,26 @@ def cycle_(
     peak = peak_density(r, valid)
     worth = math.log(bank.mu_floor * NEGLIGIBLE_RISE)  # -inf without a floor
     best = -np.inf
+    x, P = stack_vector(MAX_STATES), stack_matrix(MAX_STATES, MAX_STATES)
     for k in range(n_modes):
         j = work.order[k]
         c = work.c[j]
+        reachable = c >= UNREACHABLE
+        log_c = math.log(c) if reachable else LOG_FLOOR
+        work.log_c[j] = log_c
         log_l = LOG_FLOOR
-        if c < UNREACHABLE:
-            work.c[j] = 0.0
-        elif math.log(c) + peak > best + worth:
+        limit = log_c + peak + region_limit(bank, work, j, z, r, valid, age)
+        if reachable and limit > best + worth:
             for i in range(n_modes):
                 p = obj.Pi[i, j] * work.mu[i]
                 work.w[i] = p / c if p > NEGLIGIBLE_WEIGHT * c else 0.0
             if not bank.is_particle[j]:
-                mix_(n, bank, obj, work, j, m)
-                predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
-                log_l = update_mode_(n, bank, work, j, z, r, valid, age)
-                best = max(best, math.log(c) + log_l)
-            elif (
-                math.log(c) + peak + particle_limit(bank, obj, work, j, m, z, r, valid, age)
-                > best + worth
-            ):
+                mix_(n, bank, obj, work, j, m, x, P)
+                predict_(n, x, P, bank.F[m, j], bank.Q[m, j])
+                log_l = update_mode_(n, bank, work, j, x, P, z, r, valid, age)
+                put_(n, x, P, work.x[j], work.P[j])
+                best = max(best, log_c + log_l)
+            elif limit + particle_limit(bank, obj, work, j, m, z, r, valid, age) > best + worth:
                 log_l = update_particles_(
                     bank, obj, work, j, m, z, r, valid, age, particles, spare, weights, noise
                 )
@@ -280,13 +297,10 @@ def cycle_(
             keep_combined_(n, obj, work.x[j], work.P[j])
             log_l = LOG_FLOOR
         obj.log_l[j] = log_l
-    if not normalise_(n_modes, obj.mu, obj.log_l, work.c, bank.mu_floor):
+    if not normalise_(n_modes, obj.mu, obj.log_l, work.log_c, bank.mu_floor):
         return FAILED
     for j in range(n_modes):
-        for s in range(n):
-            obj.x[j, s] = work.x[j, s]
-            for t in range(n):
-                obj.P[j, s, t] = work.P[j, s, t]
+        put_(n, work.x[j], work.P[j], obj.x[j], obj.P[j])
     combine_(n, bank, obj, work)
     learn_lane_(bank, obj)
     return OK
@@ -307,9 +321,8 @@ def birth_(
     obj.lane_scans = 0.0
     work.lane_width = obj.lane_width
     work.elapsed = 0.1
+    x, P = stack_vector(MAX_STATES), stack_matrix(MAX_STATES, MAX_STATES)
     for j in range(n_modes):
-        x = work.x[j]
-        P = work.P[j]
         for s in range(n):
             x[s] = 0.0
             for t in range(n):
@@ -322,7 +335,7 @@ def birth_(
             if bank.entry_var[j, s] >= 0.0:
                 x[s] = bank.entry_mean[j, s]
                 P[s, s] = bank.entry_var[j, s]
-        work.c[j] = bank.mu0[j]
+        log_c = math.log(bank.mu0[j])
         for c in range(bank.n_bounds[j]):
             s = bank.bound_state[j, c]
             # Of a speed that is not measured the prior says enough to tell what stands still.
@@ -332,24 +345,21 @@ def birth_(
                 v = z[s] if s % 2 == 1 and valid[s] else x[s]
                 base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work, v)
                 sd = math.sqrt(r[s]) if valid[s] else bank.birth_std[s]
-                work.c[j] *= math.exp(
-                    normal_mass(
-                        (base + bank.bound_lower[j, c] - v) / sd,
-                        (base + bank.bound_upper[j, c] - v) / sd,
-                    )
+                log_c += normal_mass(
+                    (base + bank.bound_lower[j, c] - v) / sd,
+                    (base + bank.bound_upper[j, c] - v) / sd,
                 )
-        log_l = update_mode_(n, bank, work, j, z, r, valid, age)
+        work.log_c[j] = log_c
+        log_l = update_mode_(n, bank, work, j, x, P, z, r, valid, age)
+        put_(n, x, P, work.x[j], work.P[j])
         if bank.is_particle[j]:
             log_l = LOG_FLOOR  # entered from another mode, never born into
         obj.log_l[j] = log_l if log_l > LOG_FLOOR else LOG_FLOOR
         obj.mu[j] = bank.mu0[j]
-    if not normalise_(n_modes, obj.mu, obj.log_l, work.c, bank.mu_floor):
+    if not normalise_(n_modes, obj.mu, obj.log_l, work.log_c, bank.mu_floor):
         return FAILED
     for j in range(n_modes):
-        for s in range(n):
-            obj.x[j, s] = work.x[j, s]
-            for t in range(n):
-                obj.P[j, s, t] = work.P[j, s, t]
+        put_(n, work.x[j], work.P[j], obj.x[j], obj.P[j])
     combine_(n, bank, obj, work)
     return OK
 
@@ -374,11 +384,8 @@ def extrapolate_(
         for i in range(n_modes):
             v += bank.Pi[m, i, j] * obj.mu[i]
         mu[j] = v
-        for s in range(n):
-            work.x[j, s] = obj.x[j, s]
-            for t in range(n):
-                work.P[j, s, t] = obj.P[j, s, t]
-        predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j], work.row)
+        put_(n, obj.x[j], obj.P[j], work.x[j], work.P[j])
+        predict_(n, work.x[j], work.P[j], bank.F[m, j], bank.Q[m, j])
         for s in range(n):
             x[s] += work.c[j] * work.x[j, s]
     for j in range(n_modes):
@@ -389,7 +396,8 @@ def extrapolate_(
                 )
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+# Within `entry`, which knows its arrays by address alone, nobody counts references to them.
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def process_scan_(
     bank: Any,
     objects: Any,
@@ -438,14 +446,14 @@ def process_scan_(
         if steps[k] < 0:
             status[k] = birth_(bank[0], objects[s], work[0], z[k], r[k], valid[k], age)
             continue
-        one = (
-            bank[0], objects[s], work[0], steps[k], z[k], r[k], valid[k], age, gate,
-            particles[s], spare, weights, noise,
-        )  # fmt: skip
-        # The number of states as a constant lets the compiler unroll everything.
+        # The number of states as a constant lets the compiler unroll everything; in a call with a
+        # starred tuple it would be none.
         if bank[0].n_states == 4:
-            status[k] = cycle_(4, *one)
+            status[k] = cycle_(4, bank[0], objects[s], work[0], steps[k], z[k], r[k], valid[k], age,
+                               gate, particles[s], spare, weights, noise)  # fmt: skip
         elif bank[0].n_states == 5:
-            status[k] = cycle_(5, *one)
+            status[k] = cycle_(5, bank[0], objects[s], work[0], steps[k], z[k], r[k], valid[k], age,
+                               gate, particles[s], spare, weights, noise)  # fmt: skip
         else:
-            status[k] = cycle_(bank[0].n_states, *one)
+            status[k] = cycle_(6, bank[0], objects[s], work[0], steps[k], z[k], r[k], valid[k], age,
+                               gate, particles[s], spare, weights, noise)  # fmt: skip

@@ -8,80 +8,81 @@ from typing import Any
 import numba
 import numpy as np
 
-from can_imm.estimation.constraints import normal_probability
+from can_imm.estimation.constraints import interval_probability
 from can_imm.estimation.layout import FIXED, GROUND, SPEED_STEP
-from can_imm.types import VX, FloatArray, X
+from can_imm.estimation.stack import element, stack_matrix, stack_vector
+from can_imm.types import MAX_STATES, VX, FloatArray, X
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def enter_(
+    n: int, bank: Any, obj: Any, i: int, j: int, tau: float, m: FloatArray, A: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """What source i brings into mode j: mean into m (n,), lower half of the covariance into A.
+
+    Where bit s of ``entry_sources[i, j]`` is set, state s is replaced by the mode's entry
+    distribution: what a vehicle that starts this manoeuvre does, not what it did before.  Where
+    that is the speed ahead, the change took place at some instant of the last ``tau`` seconds, all
+    equally likely: x is set back accordingly, with exact first and second moments.  (Sideways the
+    same would only blur a lane change, whose speed builds up within the interval.)
+    """
+    for s in range(n):
+        m[s] = obj.x[i, s]
+        for t in range(s + 1):
+            A[s, t] = obj.P[i, s, t]
+    replaced = bank.entry_sources[i, j]
+    if not replaced:
+        return
+    for s in range(n):
+        if replaced >> s & 1:
+            m[s] = bank.entry_mean[j, s]
+        for t in range(s + 1):
+            if replaced & (1 << s | 1 << t):
+                A[s, t] = bank.entry_var[j, s] if s == t else 0.0
+    if replaced & (SPEED_STEP | 1 << X) != SPEED_STEP:
+        return
+    # x - a (v_new - v_old), the change a seconds before the end of the interval
+    dv = bank.entry_mean[j, VX] - obj.x[i, VX]
+    spread = bank.entry_var[j, VX] + obj.P[i, VX, VX]
+    m[X] -= 0.5 * tau * dv
+    A[X, X] += tau * obj.P[i, X, VX] + tau * tau * (spread / 3.0 + dv * dv / 12.0)
+    A[VX, X] = -0.5 * tau * bank.entry_var[j, VX]
+    for s in range(VX + 1, n):
+        if not replaced >> s & 1:
+            A[s, X] += 0.5 * tau * obj.P[i, VX, s]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def mix_(
-    n: int, bank: Any, obj: Any, work: Any, j: int, m: int
+    n: int, bank: Any, obj: Any, work: Any, j: int, m: int, x: FloatArray, P: FloatArray
 ) -> None:  # pragma: no cover - compiled
-    """Interaction (15)(16) for target mode j: mixed mean and covariance into work.x[j], work.P[j].
+    """Interaction (15)(16) for target mode j: mixed mean into x (n,), covariance into P (n, n).
 
-    Where bit s of ``entry_sources[i, j]`` is set, state s of source i is replaced by the mode's
-    entry distribution: what a vehicle that starts this manoeuvre does, not what it did before.
-    Where that is the speed ahead, the change took place at some instant of the last ``m`` steps,
-    all equally likely: x is set back accordingly, with exact first and second moments.  (Sideways
-    the same would only blur a lane change, whose speed builds up within the interval.)
-    ``work.w`` holds the mixing weights.
+    ``work.w`` holds the mixing weights; ``m`` is the number of steps since the last measurement.
     """
-    n_modes = bank.n_modes
     tau = m * bank.step_s
-    n_sources = 0
-    entered = 0  # states that are replaced for any source
-    for i in range(n_modes):
-        if work.w[i] > 0.0:
-            work.source[n_sources] = i
-            entered |= bank.entry_sources[i, j]
-            n_sources += 1
+    from_x, from_P = stack_vector(MAX_STATES), stack_matrix(MAX_STATES, MAX_STATES)
+    d = stack_vector(MAX_STATES)
     for s in range(n):
-        v = 0.0
-        for k in range(n_sources):
-            i = work.source[k]
-            d = obj.x[i, s]
-            if bank.entry_sources[i, j] >> s & 1:
-                d = bank.entry_mean[j, s]
-            elif s == X and bank.entry_sources[i, j] & SPEED_STEP:
-                d -= 0.5 * tau * (bank.entry_mean[j, VX] - obj.x[i, VX])
-            work.sx[k, s] = d
-            v += work.w[i] * d
-        for k in range(n_sources):
-            work.sx[k, s] -= v
-        work.x[j, s] = v
-    for s in range(n):
+        x[s] = 0.0
         for t in range(s + 1):
-            replaced = 1 << s | 1 << t
-            v = 0.0
-            for k in range(n_sources):
-                i = work.source[k]
-                p = work.sx[k, s] * work.sx[k, t]
-                if not entered & replaced or not bank.entry_sources[i, j] & replaced:
-                    p += obj.P[i, s, t]
-                elif s == t:
-                    p += bank.entry_var[j, s]
-                v += work.w[i] * p
-            work.P[j, s, t] = v
-            work.P[j, t, s] = v
-    if not entered & SPEED_STEP:
-        return
-    for k in range(n_sources):
-        i = work.source[k]
-        if bank.entry_sources[i, j] & (SPEED_STEP | 1 << X) != SPEED_STEP:
-            continue
-        # x - a (v_new - v_old), the change a seconds before the end of the interval
-        dv = bank.entry_mean[j, VX] - obj.x[i, VX]
-        spread = bank.entry_var[j, VX] + obj.P[i, VX, VX]
-        p = tau * obj.P[i, X, VX] + tau * tau * (spread / 3.0 + dv * dv / 12.0)
-        work.P[j, X, X] += work.w[i] * p
-        for s in range(1, n):
-            p = 0.0
-            if s == VX:
-                p = -0.5 * tau * bank.entry_var[j, VX]
-            elif not bank.entry_sources[i, j] >> s & 1:
-                p = 0.5 * tau * obj.P[i, VX, s]
-            work.P[j, s, X] += work.w[i] * p
-            work.P[j, X, s] = work.P[j, s, X]
+            P[s, t] = 0.0
+    for i in range(bank.n_modes):
+        if work.w[i] > 0.0:
+            # covariances are of no use here, and the compiler leaves them out
+            enter_(n, bank, obj, i, j, tau, from_x, from_P)
+            for s in range(n):
+                x[s] += work.w[i] * from_x[s]
+    for i in range(bank.n_modes):
+        if work.w[i] > 0.0:
+            enter_(n, bank, obj, i, j, tau, from_x, from_P)
+            for s in range(n):
+                d[s] = from_x[s] - x[s]
+                for t in range(s + 1):
+                    P[s, t] += work.w[i] * (from_P[s, t] + d[s] * d[t])
+    for s in range(n):
+        for t in range(s):
+            P[t, s] = P[s, t]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -121,8 +122,8 @@ def transitions_(
                             for t in range(n):
                                 q += f * bank.F[m, i, s, t] * obj.P[i, k, t]
                     work.tx[s] = v
-                    work.var[s] = 1.0 / math.sqrt(max(q, bank.var_floor))
-            intervals_(bank, j, work.tx, True, work)
+                    work.var[s] = max(q, bank.var_floor)
+            intervals_(n, bank, j, work.tx, True, work)
             for c in range(bank.n_bounds[j]):
                 s = bank.bound_state[j, c]
                 if not bank.bound_mass[j, c] or (bank.entry_sources[i, j] >> s & 1):
@@ -131,10 +132,7 @@ def transitions_(
                     p = 0.0
                     break
                 if work.lower[c] > -np.inf or work.upper[c] < np.inf:
-                    p *= normal_probability(
-                        (work.lower[c] - work.tx[s]) * work.var[s],
-                        (work.upper[c] - work.tx[s]) * work.var[s],
-                    )
+                    p *= interval_probability(work.tx[s], work.var[s], work.lower[c], work.upper[c])
             obj.Pi[i, j] = p
             total += p
         if total > 1e-30:
@@ -148,7 +146,7 @@ def transitions_(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def intervals_(
-    bank: Any, j: int, x: FloatArray, only_mass: bool, work: Any
+    n: int, bank: Any, j: int, x: FloatArray, only_mass: bool, work: Any
 ) -> None:  # pragma: no cover - compiled
     """The intervals of mode j's bounds around x into work.lower, work.upper.
 
@@ -164,7 +162,7 @@ def intervals_(
         if only_mass and not bank.bound_mass[j, c]:
             continue
         s = bank.bound_state[j, c]
-        base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work, x[s])
+        base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work, element(n, x, s))
         first = c
         for d in range(c - 1, -1, -1):
             if bank.bound_state[j, d] == s and (bank.bound_mass[j, d] or not only_mass):

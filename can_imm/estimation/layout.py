@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from can_imm.estimation.particles import PARTICLE_DTYPE
-from can_imm.types import VX
+from can_imm.types import MAX_STATES, VX
 
 LOG_FLOOR = -1e30
 
@@ -35,9 +35,6 @@ that what stands still or comes towards us is never claimed."""
 
 MAX_MODES = 24
 """Largest number of modes in a bank."""
-
-MAX_STATES = 6
-"""Largest number of states in a mode."""
 
 MAX_STEPS = 201
 """Length of the tables over elapsed steps: two seconds of 10 ms."""
@@ -129,13 +126,11 @@ WORK_DTYPE = np.dtype(
         ("x", np.float64, (_M, _N)),
         ("P", np.float64, (_M, _N, _N)),
         ("c", np.float64, (_M,)),
+        ("log_c", np.float64, (_M,)),
         ("w", np.float64, (_M,)),
         ("mu", np.float64, (_M,)),
-        ("sx", np.float64, (_M, _N)),
         ("tx", np.float64, (_N,)),
         ("tP", np.float64, (_N, _N)),
-        ("h", np.float64, (_N,)),
-        ("row", np.float64, (_N + 1, _N)),
         ("L", np.float64, (4, 4)),
         ("lower", np.float64, (_K,)),
         ("upper", np.float64, (_K,)),
@@ -144,7 +139,6 @@ WORK_DTYPE = np.dtype(
         ("ground", np.float64),
         ("angle", np.float64),
         ("elapsed", np.float64),
-        ("source", np.int64, (_M,)),
         ("order", np.int64, (_M,)),
     ],
     align=True,

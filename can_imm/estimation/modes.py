@@ -18,13 +18,13 @@ import numpy as np
 from can_imm.estimation.constraints import (
     LOG_MASS_FLOOR,
     interval_mass,
-    normal_probability,
+    interval_probability,
     project_,
     truncate_,
 )
 from can_imm.estimation.interaction import intervals_, reference
 from can_imm.estimation.kalman import LOG_2PI, update_row_, update_state_
-from can_imm.estimation.layout import LOG_FLOOR
+from can_imm.estimation.layout import LANE, LOG_FLOOR
 from can_imm.estimation.noise import NoiseState, load, store_, uniform
 from can_imm.estimation.particles import (
     N_COLUMNS,
@@ -36,7 +36,11 @@ from can_imm.estimation.particles import (
     resample_,
     weigh_,
 )
-from can_imm.types import AX, VX, VY, FloatArray, Y
+from can_imm.estimation.stack import diagonal, element, stack_matrix, stack_vector
+from can_imm.types import AX, MAX_STATES, VX, VY, FloatArray, Y
+
+FASTEST, SWIFTEST = 150.0, 20.0
+"""No object is faster [m/s], or changes its speed faster [m/s^2], while a measurement ages."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -50,14 +54,16 @@ def constrain_soft_(
     """
     bad = 0.0
     for c in range(bank.n_soft[j]):
-        s = bank.soft_state[j, c]
+        state = bank.soft_state[j, c]
         value = bank.soft_value[j, c] + reference(
-            bank.soft_kind[j, c], bank.soft_lanes[j, c], work, x[s]
+            bank.soft_kind[j, c], bank.soft_lanes[j, c], work, element(n, x, state)
         )
         r = bank.soft_r[j, c]
         if bank.soft_density[j, c]:
             r /= work.elapsed
-        bad += 0.0 * update_state_(n, x, P, s, value, r, work.row)[1]
+        for s in range(n):
+            if s == state:  # a constant in each branch, see `stack`
+                bad += 0.0 * update_state_(n, x, P, s, value, r)[1]
     return bad
 
 
@@ -71,8 +77,6 @@ def correct_(
     valid: Any,
     age: float,
     angle: float,
-    h: FloatArray,
-    row: FloatArray,
 ) -> float:  # pragma: no cover - compiled
     """Measurement update with the valid components of z, in place.
 
@@ -81,26 +85,26 @@ def correct_(
         angle: of the axes in which z was measured, against those of ``x`` [rad].
         age: how long before the time of ``x`` the measurement was taken [s]; a position measured
             then is x - age vx + age^2/2 ax now.
-        h: (n,) scratch.  row: (>= 2, n) scratch.
 
     Returns:
         Log density of z; NaN on a numeric failure.
     """
-    cos, sin = 1.0, 0.0
-    if angle != 0.0:
-        cos, sin = math.cos(angle), math.sin(angle)
     # one logarithm for all components
     square = 0.0
     product = 1.0
     count = 0
+    if age == 0.0 and angle == 0.0:
+        for c in range(4):
+            if valid[c]:
+                e, v = update_state_(n, x, P, c, z[c], r[c])
+                square += e * e / v
+                product *= v
+                count += 1
+        return -0.5 * (count * LOG_2PI + math.log(product) + square)
+    cos, sin = math.cos(angle), math.sin(angle)
+    h = stack_vector(MAX_STATES)
     for c in range(4):
         if not valid[c]:
-            continue
-        count += 1
-        if age == 0.0 and angle == 0.0:
-            e, v = update_state_(n, x, P, c, z[c], r[c], row)
-            square += e * e / v
-            product *= v
             continue
         for s in range(n):
             h[s] = 0.0
@@ -120,9 +124,10 @@ def correct_(
                 h[s + 1] = share
                 if a < n:
                     h[a] = -age * share
-        e, v = update_row_(n, x, P, h, z[c], r[c], row)
+        e, v = update_row_(n, x, P, h, z[c], r[c])
         square += e * e / v
         product *= v
+        count += 1
     return -0.5 * (count * LOG_2PI + math.log(product) + square)
 
 
@@ -137,21 +142,18 @@ def mass_(
     """
     if n_bounds == 0:
         return 0.0
-    last = n_bounds - 1
-    if last == 0:
-        return interval_mass(x, P, state[0], work.lower[0], work.upper[0])
+    left_x, left_P = stack_vector(MAX_STATES), stack_matrix(MAX_STATES, MAX_STATES)
     for s in range(n):
-        work.tx[s] = x[s]
+        left_x[s] = x[s]
         for t in range(n):
-            work.tP[s, t] = P[s, t]
+            left_P[s, t] = P[s, t]
     log_mass = 0.0
+    last = n_bounds - 1
     for c in range(last):
-        log_mass += truncate_(
-            n, work.tx, work.tP, state[c], work.lower[c], work.upper[c], floor, work.row
-        )
-    return log_mass + interval_mass(
-        work.tx, work.tP, state[last], work.lower[last], work.upper[last]
-    )
+        log_mass += truncate_(n, left_x, left_P, state[c], work.lower[c], work.upper[c], floor)
+    # nobody needs the moments of the last one
+    mean, p = element(n, left_x, state[last]), diagonal(n, left_P, state[last])
+    return log_mass + interval_mass(mean, p, work.lower[last], work.upper[last])
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -160,25 +162,25 @@ def update_mode_(
     bank: Any,
     work: Any,
     j: int,
+    x: FloatArray,
+    P: FloatArray,
     z: FloatArray,
     r: FloatArray,
     valid: Any,
     age: float,
 ) -> float:  # pragma: no cover - compiled
-    """Constraint and measurement update of Gaussian mode j in work.x[j], work.P[j]; its log L."""
-    x = work.x[j]
-    P = work.P[j]
+    """Constraint and measurement update of Gaussian mode j in x (n,), P (n, n); its log L."""
     log_l = constrain_soft_(n, bank, j, x, P, work)
     n_bounds = bank.n_bounds[j]
     # The lane is that of the prior, for the posterior too.
-    intervals_(bank, j, x, False, work)
+    intervals_(n, bank, j, x, False, work)
     empty = False
     for c in range(n_bounds):
         empty = empty or not work.lower[c] < work.upper[c]
     prior = 0.0
     if not empty:
         prior = mass_(n, x, P, n_bounds, bank.bound_state[j], bank.var_floor, work)
-    log_l += correct_(n, x, P, z, r, valid, age, work.angle, work.h, work.row)
+    log_l += correct_(n, x, P, z, r, valid, age, work.angle)
     if empty or prior < LOG_MASS_FLOOR + 1.0:
         return LOG_FLOOR  # the constraint contradicts the past beyond what numbers can tell
     posterior = 0.0
@@ -186,17 +188,17 @@ def update_mode_(
         # The mass needs the Gaussian before it is projected.
         posterior = mass_(n, x, P, n_bounds, bank.bound_state[j], bank.var_floor, work)
     for c in range(n_bounds):
-        s = bank.bound_state[j, c]
         lower = work.lower[c]
         upper = work.upper[c]
         if lower == -np.inf and upper == np.inf:
             continue  # one interval with another row
+        state = bank.bound_state[j, c]
         if not bank.is_projected[j]:
-            posterior += truncate_(n, x, P, s, lower, upper, bank.var_floor, work.row)
-        elif x[s] < lower:
-            project_(n, x, P, s, lower, bank.var_floor, work.row)
-        elif x[s] > upper:
-            project_(n, x, P, s, upper, bank.var_floor, work.row)
+            posterior += truncate_(n, x, P, state, lower, upper, bank.var_floor)
+            continue
+        mean = element(n, x, state)
+        if mean < lower or mean > upper:
+            project_(n, x, P, state, lower if mean < lower else upper, bank.var_floor)
     return log_l + posterior - prior
 
 
@@ -209,6 +211,30 @@ def keep_combined_(
         x[s] = obj.mean[s]
         for t in range(n):
             P[s, t] = obj.cov[s, t]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def region_limit(
+    bank: Any, work: Any, j: int, z: FloatArray, r: FloatArray, valid: Any, age: float
+) -> float:  # pragma: no cover - compiled
+    """Log of a bound on what mode j can say of z, over the peak density of the measurement.
+
+    Its states lie within its bounds, so that z is no likelier than seen from the nearest point
+    there.  Bounds that go with a lane, and axes that are turned, are not looked at.
+    """
+    limit = 0.0
+    if work.angle != 0.0:
+        return limit
+    for c in range(bank.n_bounds[j]):
+        s = bank.bound_state[j, c]
+        if s >= 4 or not valid[s] or bank.bound_kind[j, c] == LANE:
+            continue
+        base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work, 0.0)
+        outside = max(base + bank.bound_lower[j, c] - z[s], z[s] - base - bank.bound_upper[j, c])
+        outside -= age * (SWIFTEST if s % 2 else FASTEST)
+        if outside > 0.0:
+            limit = min(limit, -0.5 * outside * outside / r[s])
+    return limit
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -256,8 +282,8 @@ def particle_limit(
             y += gain * e
             yy -= gain * gain * s
             p = math.exp(-0.5 * e * e / s) * math.sqrt(r[Y] / s)
-        sd = math.sqrt(max(yy, bank.var_floor))
-        share += work.w[i] * p * normal_probability((par.y_low - y) / sd, (par.y_high - y) / sd)
+        yy = max(yy, bank.var_floor)
+        share += work.w[i] * p * interval_probability(y, yy, par.y_low, par.y_high)
     return limit + math.log(share)
 
 

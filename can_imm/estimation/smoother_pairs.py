@@ -9,8 +9,8 @@ import numba
 import numpy as np
 
 from can_imm.estimation.kalman import predict_
-from can_imm.estimation.layout import MAX_MODES, MAX_STATES, SPEED_STEP
-from can_imm.types import AX, VX, VY, FloatArray, X, Y
+from can_imm.estimation.layout import MAX_MODES, SPEED_STEP
+from can_imm.types import AX, MAX_STATES, VX, VY, FloatArray, X, Y
 
 LEAST_INFORMATION = 1e-9
 """What a component is taken to be told in any case, relative to what its prediction knew."""
@@ -39,7 +39,6 @@ SMOOTHER_DTYPE = np.dtype(
         ("r", np.float64, (_N,)),
         ("e", np.float64, (_N,)),
         ("g", np.float64, (_N,)),
-        ("row", np.float64, (_N + 1, _N)),
     ],
     align=True,
 )
@@ -182,7 +181,7 @@ def move_pair_(
     A = work.pP[i]
     C = work.C[i]
     F = bank.F[m, j]
-    predict_(n, px, A, F, bank.Q[m, j], work.row)
+    predict_(n, px, A, F, bank.Q[m, j])
     for s in range(n):
         for t in range(n):
             work.e[t] = 0.0

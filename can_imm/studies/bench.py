@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +139,9 @@ def measure(cases: Sequence[Case], rounds: int) -> Iterator[Result]:
 
 def machine() -> dict[str, Any]:
     """Where and with what the figures were measured."""
-    names = ("numpy", "numba", "filterpy", "python-can", "cantools")
+    names = ["numpy", "numba", "filterpy", "python-can", "cantools"]
+    if find_spec("stonesoup") is not None:
+        names.append("stonesoup")
     return {
         "system": platform.platform(),
         "processor": _processor(),
@@ -223,7 +226,7 @@ class Estimator:
         process, address, n, z = self._processor.run, self._processor.address, self._n, self._z
         self._steps[:] = -1
         for k, row in enumerate(self.scans):
-            z[:] = row
+            z[...] = row
             process(address, n, layout.UNKNOWN_GROUND, 0.0, 0.0)
             if k == 0:
                 self._steps[:] = STEPS
@@ -242,12 +245,25 @@ def _filterpy(bank: ModeBank) -> None:
         peer.update(row)
 
 
+def _stonesoup(bank: ModeBank) -> None:
+    """The same measurements through Stone Soup."""
+    from can_imm.studies.peer_stonesoup import SoupImm
+
+    assert bank.measurement_variance is not None
+    z = _measurements()
+    peer = SoupImm(bank, STEPS, [0, 1, 2, 3], bank.measurement_variance, z[0])
+    for row in z[1:]:
+        peer.predict()
+        peer.update(row)
+
+
 def _estimator_side(bank: ModeBank, n: int, name: str = "can-imm", per_object: bool = True) -> Side:
     return Side(name, Estimator(bank, n).run, SCANS * (n if per_object else 1))
 
 
 def estimator_cases() -> list[Case]:
-    """Steps of the estimator: against filterpy, over objects, over particles."""
+    """Steps of the estimator: against filterpy, and Stone Soup where it is installed, over objects,
+    over particles."""
     six, seven = six_filters(), with_particles(500)
     alone = _estimator_side(six, 1, "one object alone")
     few = _estimator_side(seven, 1, "500 particles")
@@ -257,6 +273,12 @@ def estimator_cases() -> list[Case]:
         Case("imm7_pf500", "IMM step, the same and 500 particles", few,
              Side("filterpy and numpy", partial(_filterpy, seven), SCANS), True, 100.0),
     ]  # fmt: skip
+    if find_spec("stonesoup") is not None:
+        cases.append(
+            Case("imm6_stonesoup", "IMM step, six constrained Kalman filters",
+                 _estimator_side(six, 1), Side("Stone Soup and numpy",
+                 partial(_stonesoup, six), SCANS), True, None)
+        )  # fmt: skip
     for n, target in ((16, None), (64, 0.8), (256, None)):
         side = _estimator_side(six, n)
         what = f"six filters, per object at {n} in one call"

@@ -24,34 +24,24 @@ LEAST_LIKELIHOOD = 1e-30
 """filterpy turns a mode of probability zero into NaN."""
 
 
-class ConstrainedFilter(KalmanFilter):  # type: ignore[misc]
-    """One Gaussian mode: soft rows before the measurement, truncation or projection after it.
+class Constraint:
+    """What one Gaussian mode asks for: soft rows before the measurement, bounds after it.
 
     Args:
         bank: mode bank.
         j: number of the mode.
-        steps: steps of the loop from one measurement to the next.
-        seen: (K,) indices of the measured states.
-        variance: (K,) of the measurement.
+
+    Attributes:
+        soft_state: (K,) indices of the states that have a soft row.  soft_variance: (K,).
     """
 
-    def __init__(
-        self, bank: ModeBank, j: int, steps: int, seen: list[int], variance: FloatArray
-    ) -> None:
-        record, n = bank.record[0], bank.n_states
-        super().__init__(dim_x=n, dim_z=len(seen))
-        self.x: FloatArray
-        self.P: FloatArray
-        self.F = record["F"][steps, j, :n, :n].copy()
-        self.Q = record["Q"][steps, j, :n, :n].copy()
-        self.H = np.eye(n)[seen]
-        self.R = np.diag(variance)
+    def __init__(self, bank: ModeBank, j: int) -> None:
+        record = bank.record[0]
         self._width = bank.lane_width
         m = record["n_soft"][j]
-        self._soft_state = record["soft_state"][j, :m].copy()
-        self._soft_H = np.eye(n)[self._soft_state]
-        self._soft_z = record["soft_value"][j, :m].copy()
-        self._soft_R = np.diag(record["soft_r"][j, :m])
+        self.soft_state = record["soft_state"][j, :m].copy()
+        self.soft_variance: FloatArray = record["soft_r"][j, :m].copy()
+        self._soft_value = record["soft_value"][j, :m].copy()
         self._soft_lane = _lane_row(record["soft_kind"][j, :m], record["soft_lanes"][j])
         m = record["n_bounds"][j]
         names = ("bound_state", "bound_lower", "bound_upper")
@@ -60,44 +50,47 @@ class ConstrainedFilter(KalmanFilter):  # type: ignore[misc]
         self._bound_lane = _lane_row(kinds, record["bound_lanes"][j])
         self._projects = bool(record["is_projected"][j])
         self._var_floor = float(record["var_floor"])
-        self._log_ratio = 0.0
 
-    def update(self, z: Any, R: Any = None, H: Any = None) -> None:
-        """Soft rows as pseudo-measurements, the measurement, the bounds."""
-        if len(self._soft_z):
-            d = self._soft_z
-            if self._soft_lane is not None:
-                d = d.copy()
-                row, lanes = self._soft_lane
-                d[row] += self._centre(self.x[self._soft_state[row]], lanes)
-            super().update(d, R=self._soft_R, H=self._soft_H)
+    def soft(self, x: FloatArray) -> FloatArray:
+        """(K,) what the soft rows ask of x (n,)."""
+        d: FloatArray = self._soft_value
+        if self._soft_lane is not None:
+            d = d.copy()
+            row, lanes = self._soft_lane
+            d[row] += self._centre(x[self.soft_state[row]], lanes)
+        return d
+
+    def bounds(self, x: FloatArray) -> list[tuple[int, float, float]]:
+        """State, lower and upper bound of each row, around x (n,)."""
         bounds = self._bounds
         if self._bound_lane is not None:
             row, lanes = self._bound_lane
             state, lower, upper = bounds[row]
-            base = self._centre(self.x[state], lanes)
+            base = self._centre(x[state], lanes)
             bounds = [*bounds]
             bounds[row] = (state, base + lower, base + upper)
-        x, P = self.x, self.P
-        self._log_ratio = 0.0
-        for bound in bounds:
-            x, P, log_mass = self._truncated(x, P, *bound)
-            self._log_ratio -= log_mass
-        super().update(z)
-        x, P = self.x, self.P
-        for bound in bounds:
-            x, P, log_mass = self._truncated(x, P, *bound)
-            self._log_ratio += log_mass
-        if not self._projects:
-            self.x, self.P = x, P
-            return
-        for bound in bounds:
-            self._project(*bound)
+        return bounds
 
-    @property
-    def likelihood(self) -> float:
-        """Density of the measurement given the constraint."""
-        return max(math.exp(self.log_likelihood + self._log_ratio), LEAST_LIKELIHOOD)
+    def truncated(
+        self, x: FloatArray, P: FloatArray, bounds: list[tuple[int, float, float]]
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Moments of N(x, P) within the bounds and the log of its mass there."""
+        log_mass = 0.0
+        for bound in bounds:
+            x, P, part = self._truncated(x, P, *bound)
+            log_mass += part
+        return x, P, log_mass
+
+    def applied(
+        self, x: FloatArray, P: FloatArray, bounds: list[tuple[int, float, float]]
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """N(x, P) truncated, or projected, and the log of its mass within the bounds."""
+        inside_x, inside_P, log_mass = self.truncated(x, P, bounds)
+        if not self._projects:
+            return inside_x, inside_P, log_mass
+        for bound in bounds:
+            x, P = self._projected(x, P, *bound)
+        return x, P, log_mass
 
     def _centre(self, y: float, lanes: FloatArray) -> float:
         k = min(max(math.floor(y / self._width + 0.5), lanes[0]), lanes[1])
@@ -120,15 +113,62 @@ class ConstrainedFilter(KalmanFilter):  # type: ignore[misc]
         k = P[:, state] / p
         return x + k * mean * sd, P + np.outer(k, k) * p * (variance - 1.0), float(log_mass)
 
-    def _project(self, state: int, lower: float, upper: float) -> None:
+    def _projected(
+        self, x: FloatArray, P: FloatArray, state: int, lower: float, upper: float
+    ) -> tuple[FloatArray, FloatArray]:
         """Onto the violated bound, with W = P^-1 (Simon and Chia 2002)."""
-        value = min(max(self.x[state], lower), upper)
-        if value == self.x[state]:
-            return
-        k = self.P[:, state] / self.P[state, state]
-        self.x = self.x - k * (self.x[state] - value)
-        self.P = self.P - np.outer(k, self.P[state])
-        self.P[state, state] = self._var_floor
+        value = min(max(x[state], lower), upper)
+        if value == x[state]:
+            return x, P
+        k = P[:, state] / P[state, state]
+        x = x - k * (x[state] - value)
+        P = P - np.outer(k, P[state])
+        P[state, state] = self._var_floor
+        return x, P
+
+
+class ConstrainedFilter(KalmanFilter):  # type: ignore[misc]
+    """One Gaussian mode: soft rows before the measurement, truncation or projection after it.
+
+    Args:
+        bank: mode bank.
+        j: number of the mode.
+        steps: steps of the loop from one measurement to the next.
+        seen: (K,) indices of the measured states.
+        variance: (K,) of the measurement.
+    """
+
+    def __init__(
+        self, bank: ModeBank, j: int, steps: int, seen: list[int], variance: FloatArray
+    ) -> None:
+        record, n = bank.record[0], bank.n_states
+        super().__init__(dim_x=n, dim_z=len(seen))
+        self.x: FloatArray
+        self.P: FloatArray
+        self.F = record["F"][steps, j, :n, :n].copy()
+        self.Q = record["Q"][steps, j, :n, :n].copy()
+        self.H = np.eye(n)[seen]
+        self.R = np.diag(variance)
+        self._constraint = Constraint(bank, j)
+        self._soft_H = np.eye(n)[self._constraint.soft_state]
+        self._soft_R = np.diag(self._constraint.soft_variance)
+        self._log_ratio = 0.0
+
+    def update(self, z: Any, R: Any = None, H: Any = None) -> None:
+        """Soft rows as pseudo-measurements, the measurement, the bounds."""
+        constraint = self._constraint
+        if len(self._soft_H):
+            super().update(constraint.soft(self.x), R=self._soft_R, H=self._soft_H)
+        bounds = constraint.bounds(self.x)
+        before = constraint.truncated(self.x, self.P, bounds)[2]
+        super().update(z)
+        self.x, self.P, after = constraint.applied(self.x, self.P, bounds)
+        self._log_ratio = after - before
+
+    @property
+    def likelihood(self) -> float:
+        """Density of the measurement given the constraint."""
+        return max(math.exp(self.log_likelihood + self._log_ratio), LEAST_LIKELIHOOD)
 
 
 class ParticleFilter:

@@ -135,14 +135,15 @@ def test_each_entry_state_has_its_own_sources() -> None:
     runner = Runner(bank, 1)
     copy_state(Imm([], xs, Ps, w), runner.objects[0])
     runner.work[0]["w"][:3] = w
-    imm.mix_(bank[0]["n_states"], bank[0], runner.objects[0], runner.work[0], 2, 0)
+    mixed_x, mixed_P = np.empty(4), np.empty((4, 4))
+    imm.mix_(4, bank[0], runner.objects[0], runner.work[0], 2, 0, mixed_x, mixed_P)
     for i, s, mean, variance in ((0, 1, 0.7, 0.3), (1, 3, -0.2, 0.1)):
         xs[i][s] = mean
         Ps[i][s, :] = Ps[i][:, s] = 0.0
         Ps[i][s, s] = variance
     mean, cov = Imm([], xs, Ps, w).combined()
-    np.testing.assert_allclose(runner.work[0]["x"][2, :4], mean, rtol=1e-12)
-    np.testing.assert_allclose(runner.work[0]["P"][2, :4, :4], cov, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(mixed_x, mean, rtol=1e-12)
+    np.testing.assert_allclose(mixed_P, cov, rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -169,10 +170,11 @@ def test_a_new_speed_sets_in_at_any_instant_of_the_interval(
     runner = Runner(bank, 1)
     copy_state(Imm([], [x, x], [P, P], np.array([1.0, 0.0])), runner.objects[0])
     runner.work[0]["w"][:2] = [1.0, 0.0]
-    imm.mix_(record["n_states"], record, runner.objects[0], runner.work[0], 1, 50)
+    mixed_x, mixed_P = np.empty(5), np.empty((5, 5))
+    imm.mix_(5, record, runner.objects[0], runner.work[0], 1, 50, mixed_x, mixed_P)
     mean, cov = enter(x, P, entry, 0.5)
-    np.testing.assert_allclose(runner.work[0]["x"][1, :5], mean, rtol=1e-12)
-    np.testing.assert_allclose(runner.work[0]["P"][1, :5, :5], cov, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(mixed_x, mean, rtol=1e-12)
+    np.testing.assert_allclose(mixed_P, cov, rtol=1e-12, atol=1e-14)
 
 
 def test_a_speed_step_covers_the_way_that_two_speeds_cover() -> None:
@@ -231,7 +233,9 @@ def test_a_state_that_the_entry_replaces_does_not_count_in_the_transition() -> N
 
 def normalise(log_l: list[float], c: list[float], floor: float) -> tuple[bool, np.ndarray]:
     mu = np.full(len(c), 0.25)
-    return imm.normalise_(len(c), mu, np.array(log_l), np.array(c), floor), mu
+    with np.errstate(divide="ignore"):
+        log_c = np.log(c)
+    return imm.normalise_(len(c), mu, np.array(log_l), log_c, floor), mu
 
 
 def test_extreme_likelihoods_keep_their_order() -> None:
@@ -264,6 +268,22 @@ def test_an_outlier_without_a_gate_does_not_reset_the_probabilities() -> None:
     assert mu.sum() == pytest.approx(1.0)
     assert np.ptp(mu) > 0.3
     assert not np.allclose(mu, before)
+
+
+def test_a_mode_that_its_bounds_rule_out_is_not_computed() -> None:
+    """It gets the floor, as it would otherwise, and its state is that of the others."""
+    bank, scans = objects_and_scans(4)
+    runner = Runner(bank, 1)
+    runner.scan([0], [-1], scans[0][0], R)
+    obj = runner.objects[0]
+    for near in (True, False):
+        z = scans[1][0].copy()
+        z[3] = 0.3 if near else -4.0  # mode 1 is one of vy > 0.2
+        before = obj["mean"].copy()
+        assert runner.scan([0], [10], z, 0.02)[0] == imm.OK
+        assert (obj["log_l"][1] > layout.LOG_FLOOR) == near
+    assert obj["mu"][1] == pytest.approx(1e-6, rel=1e-3)
+    np.testing.assert_array_equal(obj["x"][1], before)
 
 
 def test_a_mode_without_probability_stays_finite_and_can_come_back() -> None:

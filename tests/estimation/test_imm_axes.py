@@ -57,9 +57,7 @@ def test_a_measurement_in_turned_axes(seed: int, n: int, angle: float, age: floa
     turn[2, [0, 2]] = turn[3, [1, 3]] = -sin, cos
     H = (turn @ back)[valid]
     new_x, new_P, e, S = update(x, P, H, np.diag(R[valid]), z[valid])
-    log_l = modes.correct_(
-        n, x, P, np.where(valid, z, np.nan), R, valid, age, angle, np.empty(n), np.empty((n + 1, n))
-    )
+    log_l = modes.correct_(n, x, P, np.where(valid, z, np.nan), R, valid, age, angle)
     np.testing.assert_allclose(x, new_x, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(P, new_P, rtol=1e-9, atol=1e-9)
     expected = multivariate_normal.logpdf(e, np.zeros(len(e)), S)

@@ -31,7 +31,6 @@ class Problem:
         self.F[:n, :n] = rng.normal(size=(n, n))
         self.Q = np.full((n + 1, n + 1), 77.0)
         self.Q[:n, :n] = random_covariance(rng, n)
-        self.work = np.full((n + 2, n + 1), np.nan)
 
     def filterpy(self, dim_z: int) -> KalmanFilter:
         n = self.n
@@ -57,7 +56,7 @@ def test_predict(seed: int) -> None:
     p = Problem(seed)
     f = p.filterpy(1)
     f.predict()
-    predict_(p.n, p.x, p.P, p.F, p.Q, p.work)
+    predict_(p.n, p.x, p.P, p.F, p.Q)
     p.check(f)
 
 
@@ -73,7 +72,7 @@ def test_row_by_row_equals_the_vector_update(seed: int) -> None:
     log_l = 0.0
     for c in range(dim_z):
         h = np.append(f.H[c], 77.0)
-        e, s = update_row_(p.n, p.x, p.P, h, z[c], f.R[c, c], p.work)
+        e, s = update_row_(p.n, p.x, p.P, h, z[c], f.R[c, c])
         log_l += log_normal(e, s)
     p.check(f)
     assert log_l == pytest.approx(f.log_likelihood, rel=1e-9, abs=1e-9)
@@ -90,7 +89,7 @@ def test_single_states_equal_the_vector_update(seed: int) -> None:
     f.update(z)
     log_l = 0.0
     for c, s in enumerate(states):
-        log_l += log_normal(*update_state_(p.n, p.x, p.P, s, z[c], f.R[c, c], p.work))
+        log_l += log_normal(*update_state_(p.n, p.x, p.P, s, z[c], f.R[c, c]))
     p.check(f)
     assert log_l == pytest.approx(f.log_likelihood, rel=1e-9, abs=1e-9)
 
@@ -99,7 +98,7 @@ def test_single_states_equal_the_vector_update(seed: int) -> None:
 def test_covariance_stays_symmetric_and_positive(seed: int, r: float, times: int) -> None:
     p = Problem(seed)
     for _ in range(times):
-        update_state_(p.n, p.x, p.P, int(p.rng.integers(p.n)), 0.0, r, p.work)
+        update_state_(p.n, p.x, p.P, int(p.rng.integers(p.n)), 0.0, r)
         P = p.P[: p.n, : p.n]
         np.testing.assert_array_equal(P, P.T)
         assert np.linalg.eigvalsh(P).min() >= -1e-12 * max(1.0, np.trace(P))
@@ -110,11 +109,10 @@ def test_covariance_stays_symmetric_and_positive(seed: int, r: float, times: int
     [(np.nan, 1.0, 1.0), (np.inf, 1.0, 1.0), (0.0, -2.0, 1.0), (0.0, np.nan, 1.0), (0.0, 0.0, 0.0)],
 )
 def test_a_bad_update_is_flagged_and_touches_nothing(z: float, p00: float, r: float) -> None:
-    work = np.zeros((3, 2))
     x, P = np.array([1.0, 2.0]), np.array([[p00, 0.0], [0.0, 1.0]])
     for flag in (
-        update_state_(2, x, P, 0, z, r, work)[1],
-        update_row_(2, x, P, np.array([1.0, 0.0]), z, r, work)[1],
+        update_state_(2, x, P, 0, z, r)[1],
+        update_row_(2, x, P, np.array([1.0, 0.0]), z, r)[1],
     ):
         assert np.isnan(flag)
         np.testing.assert_array_equal(x, [1.0, 2.0])
@@ -144,6 +142,6 @@ def test_measurement_with_missing_components_and_age(
         f.H, f.R = H[valid], np.diag(r[valid])
         f.update(z[valid])
         expected = f.log_likelihood
-    log_l = correct_(n, p.x, p.P, z, r, valid, age, 0.0, np.empty(n), p.work)
+    log_l = correct_(n, p.x, p.P, z, r, valid, age, 0.0)
     p.check(f)
     assert log_l == pytest.approx(expected, rel=1e-9, abs=1e-9)

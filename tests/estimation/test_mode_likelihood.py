@@ -10,11 +10,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 from oracles import gaussian
+from oracles.gaussian import random_covariance
 from scipy.stats import norm
 from small_banks import add_bound, add_soft, blank
 
-from can_imm.estimation import imm, layout
+from can_imm.estimation import imm, layout, modes
 
 INF = math.inf
 VALID_2 = np.array([True, True, False, False])
@@ -24,10 +27,10 @@ def log_likelihood(bank, x, P, z, r, valid=VALID_2, age=0.0, lane_width=3.0):
     """Of mode 0 by the kernel; also the updated mean and covariance."""
     n = int(bank[0]["n_states"])
     work = np.zeros(1, layout.WORK_DTYPE)
-    work[0]["x"][0, :n], work[0]["P"][0, :n, :n] = x, P
     work[0]["lane_width"] = lane_width
-    log_l = imm.update_mode_(bank[0]["n_states"], bank[0], work[0], 0, z, r, valid, age)
-    return log_l, work[0]["x"][0, :n], work[0]["P"][0, :n, :n]
+    x, P = x.copy(), P.copy()
+    log_l = imm.update_mode_(n, bank[0], work[0], 0, x, P, z, r, valid, age)
+    return log_l, x, P
 
 
 def soft_factor(rows: list[tuple[int, float, float]]) -> Callable[[np.ndarray], np.ndarray]:
@@ -198,3 +201,56 @@ def test_a_numeric_failure_is_a_nan() -> None:
     bank = blank(1, 2)
     add_soft(bank, 0, 0, 0.0, 1.0)
     assert np.isnan(log_likelihood(bank, X, P, z, r)[0])
+
+
+# ---- what a mode can say at most
+
+
+def limit(bank, z, r, valid, age=0.0, angle=0.0) -> float:
+    """Of mode 0, over the peak density of the measurement."""
+    work = np.zeros(1, layout.WORK_DTYPE)
+    work[0]["lane_width"], work[0]["angle"] = 3.0, angle
+    return modes.region_limit(bank[0], work[0], 0, z, r, valid, age)
+
+
+@settings(max_examples=200)
+@given(
+    st.integers(0, 2**32 - 1), st.integers(4, 6), st.booleans(), st.sampled_from([0.0, 0.02, 0.1])
+)
+def test_no_mode_says_more_than_its_bounds_allow(
+    seed: int, n: int, projected: bool, age: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    bank = blank(1, n)
+    bank[0]["is_projected"][0] = projected
+    low, width = rng.normal(0.0, 10.0), rng.choice([0.5, 5.0, INF])
+    low, high = (low, low + width) if rng.random() < 0.5 else (low - width, low)
+    add_bound(bank, 0, int(rng.integers(n)), low, high)
+    add_soft(bank, 0, int(rng.integers(4)), rng.normal(0.0, 5.0), 0.5)
+    x, P = rng.normal(0.0, 5.0, n), random_covariance(rng, n)
+    z, r = rng.normal(0.0, 15.0, 4), rng.uniform(0.05, 2.0, 4)
+    valid = rng.random(4) < 0.8
+    valid[rng.integers(4)] = True
+    at_most = limit(bank, z, r, valid, age)
+    assume(at_most > -300.0)  # masses are clipped at exp(-700)
+    peak = -0.5 * np.log(2.0 * np.pi * r[valid]).sum()
+    log_l, _, _ = log_likelihood(bank, x, P, z, r, valid, age)
+    assert log_l <= peak + at_most + 1e-9
+
+
+def test_the_limit_is_the_distance_from_the_bounds() -> None:
+    """In standard deviations of the measurement; what may have moved meanwhile does not count."""
+    z, r, all_valid = np.array([50.0, 1.0, 0.0, 0.0]), np.full(4, 0.25), np.ones(4, np.bool_)
+    bank = blank(1, 4)
+    assert limit(bank, z, r, all_valid) == 0.0
+    add_bound(bank, 0, 1, 4.0, INF)
+    assert limit(bank, z, r, all_valid) == pytest.approx(-0.5 * 3.0**2 / 0.25)
+    assert limit(bank, z, r, all_valid, age=0.05) == pytest.approx(-0.5 * 2.0**2 / 0.25)
+    assert limit(bank, z, r, np.array([True, False, True, True])) == 0.0
+    assert limit(bank, z, r, all_valid, angle=0.1) == 0.0
+    add_bound(bank, 0, 0, -INF, 45.0)
+    assert limit(bank, z, r, all_valid) == pytest.approx(-0.5 * 5.0**2 / 0.25)
+    assert limit(bank, z, r, all_valid, age=0.02) == pytest.approx(-0.5 * 2.6**2 / 0.25)
+    lane = blank(1, 4)
+    add_bound(lane, 0, 2, 1.0, 1.5, lanes=(0, 1))
+    assert limit(lane, z, r, all_valid) == 0.0

@@ -73,6 +73,36 @@ def test_filterpy_comes_to_the_same_conclusions():
     assert np.median(distance, axis=0).max() < 0.15
 
 
+def test_stone_soup_does_what_filterpy_does():
+    """The same filters by other hands: what differs is rounding."""
+    pytest.importorskip("stonesoup")
+    from can_imm.studies.peer_stonesoup import SoupImm
+
+    bank, z = bench.six_filters(), bench._measurements()
+    start = (bank, bench.STEPS, [0, 1, 2, 3], bank.measurement_variance, z[0])
+    filterpy, soup = peer.imm_peer(*start), SoupImm(*start)
+    for row in z[1:]:
+        for one in (filterpy, soup):
+            one.predict()
+            one.update(row)
+        np.testing.assert_allclose(soup.mu, filterpy.mu, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(soup.x, filterpy.x, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(soup.P, filterpy.P, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("installed", [False, True])
+def test_stone_soup_is_a_peer_where_it_is_installed(installed, monkeypatch):
+    if installed:
+        pytest.importorskip("stonesoup")
+    else:
+        monkeypatch.setattr(bench, "find_spec", lambda name: None)
+    cases = [case for case in bench.estimator_cases() if case.name == "imm6_stonesoup"]
+    assert len(cases) == installed
+    assert ("stonesoup" in bench.machine()) == installed
+    for case in cases:
+        case.peer.run()
+
+
 def test_filterpy_finds_the_objects_of_a_log(tmp_path):
     log = tmp_path / "short.log"
     bench.write_log(log, seconds=1, objects=2)
