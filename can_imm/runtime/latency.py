@@ -2,10 +2,12 @@
 
 All stamps are `time.perf_counter_ns`.  A round is one scan: sent, read, answered, handed over::
 
-    sent -receive-> read -wait-> due -late-> start -decode-> -estimate-> -encode-> -send-> over
+    sent -receive-> read -wait-> due -late-> start -send-> over
 
-``processing`` is decode to send; ``response`` is the whole way back to the sender less the wait for
-the next fixed step, which is what a bare echo node's round trip is to be compared with.
+-decode-> -estimate-> -encode-> lies in the wait, as far as that is long enough, else before send.
+``processing`` is all that the node does from the scan's last frame on, decode to send, whenever it
+does it; ``response`` is the whole way back to the sender less the wait for the next fixed step,
+which is what a bare echo node's round trip is to be compared with.
 """
 
 from __future__ import annotations
@@ -13,19 +15,22 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from can_imm.bus.echo import ECHO_ANSWER, ECHO_REQUEST
 from can_imm.bus.encoder import OUTPUT_IDS, STATUS_ID
 from can_imm.bus.frame import Frame
 from can_imm.runtime.clock import Clock
-from can_imm.runtime.feeds import FrameSource, Rehearsal
-from can_imm.runtime.loop import Node, Sink
+from can_imm.runtime.feeds import FrameSource
+from can_imm.runtime.loop import Node, Output, Sink
 
 if TYPE_CHECKING:
     from can_imm.detector import Detector
+    from can_imm.runtime.nodes import DetectorNode
     from can_imm.types import Scan
+
+T = TypeVar("T")
 
 STAGES = ("receive", "wait", "late", "decode", "estimate", "encode", "send", "processing",
           "end_to_end", "response")  # fmt: skip
@@ -82,11 +87,15 @@ class Histogram:
 
 
 class Stamps(NamedTuple):
-    """When what happened to one scan in the node [ns]."""
+    """When what happened to one scan in the node [ns].
+
+    ``start`` is the begin of the step, ``begun`` of the work on the scan, which may be earlier.
+    """
 
     read: int
     due: int
     start: int
+    begun: int
     decoded: int
     estimated: int
     encoded: int
@@ -107,9 +116,9 @@ class Probe:
         self._clock = clock
         self._guard_ns = guard_ns
         self._sensor_ids = sensor_ids
-        self._read = self._due = self._start = self._decoded = self._estimated = 0
-        self._encoded = self._sent = 0
-        self._has_scan = False
+        self._latest_read = self._read = self._due = self._start = self._sent = 0
+        self._begun = self._decoded = self._estimated = self._encoded = 0
+        self._has_scan = self._over = False
 
     def source(self, source: FrameSource) -> FrameSource:
         """Stamp the sensor's frames when they are read."""
@@ -119,17 +128,26 @@ class Probe:
         """Stamp begin and end of the detector's work; everything else passes through."""
         return _Detector(self, detector)
 
-    def node(self, node: Node) -> Node:
-        """Stamp begin and end of a step."""
+    def node(self, node: DetectorNode) -> Node:
+        """Stamp begin and end of a step, and of what is done ahead of it."""
         return _Node(self, node)
 
-    def sink(self, sink: Sink) -> Sink:
+    def sink(self, sink: Output) -> Output:
         """Stamp every frame that was handed over."""
         return _Sink(self, sink)
 
     def frame_read(self, frame: Frame) -> None:
         if frame.id in self._sensor_ids:
-            self._read = time.perf_counter_ns()
+            self._latest_read = time.perf_counter_ns()
+
+    def work(self, part: Callable[[int, list[Frame]], T], t_ns: int, frames: list[Frame]) -> T:
+        """Let the node do a part of a step."""
+        self._close()
+        had_scan, begun = self._has_scan, time.perf_counter_ns()
+        result = part(t_ns, frames)
+        if self._has_scan and not had_scan:
+            self._begun, self._encoded = begun, time.perf_counter_ns()
+        return result
 
     def step_begins(self, t_ns: int) -> None:
         self._close()
@@ -138,27 +156,30 @@ class Probe:
         self._due = self._start - late_ns
         self.lateness.add(late_ns)
 
+    def step_ends(self) -> None:
+        self._over = True
+
     def detector_begins(self, scan: Scan | None) -> None:
-        self._has_scan = scan is not None
-        self._decoded = time.perf_counter_ns()
+        if scan is not None:
+            self._has_scan = True
+            self._read, self._decoded = self._latest_read, time.perf_counter_ns()
 
     def detector_ends(self) -> None:
         self._estimated = time.perf_counter_ns()
 
-    def step_ends(self) -> None:
-        self._encoded = time.perf_counter_ns()
-
-    def frame_sent(self) -> None:
-        self._sent = time.perf_counter_ns()
+    def frame_sent(self, frame: Frame) -> None:
+        if frame.id != STATUS_ID:
+            self._sent = time.perf_counter_ns()
 
     def _close(self) -> None:
-        """The last frame of a step is known when the next step begins."""
-        if self._has_scan:
+        """The last frame of a step is known when work on the next one begins."""
+        if self._over and self._has_scan:
             self._has_scan = False
             self.finished.append(
-                Stamps(self._read, self._due, self._start, self._decoded, self._estimated,
-                       self._encoded, self._sent)
+                Stamps(self._read, self._due, self._start, self._begun, self._decoded,
+                       self._estimated, self._encoded, self._sent)
             )  # fmt: skip
+        self._over = False
 
 
 class _Source:
@@ -192,28 +213,28 @@ class _Detector:
 
 
 class _Node:
-    def __init__(self, probe: Probe, node: Node) -> None:
+    def __init__(self, probe: Probe, node: DetectorNode) -> None:
         self._probe, self._node = probe, node
+        self.rehearse = node.rehearse
 
-    def rehearse(self, t_ns: int, frames: list[Frame]) -> None:
-        rehearse: Rehearsal | None = getattr(self._node, "rehearse", None)
-        if rehearse is not None:
-            rehearse(t_ns, frames)
+    def prepare(self, t_ns: int, frames: list[Frame]) -> None:
+        self._probe.work(self._node.prepare, t_ns, frames)
 
     def step(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
         self._probe.step_begins(t_ns)
-        answers = self._node.step(t_ns, frames)
+        answers = self._probe.work(self._node.step, t_ns, frames)
         self._probe.step_ends()
         return answers
 
 
 class _Sink:
-    def __init__(self, probe: Probe, sink: Sink) -> None:
+    def __init__(self, probe: Probe, sink: Output) -> None:
         self._probe, self._sink = probe, sink
+        self.rehearse = sink.rehearse
 
     def send(self, frame: Frame) -> None:
         self._sink.send(frame)
-        self._probe.frame_sent()
+        self._probe.frame_sent(frame)
 
 
 class Rounds:
@@ -253,10 +274,11 @@ class Rounds:
         s = stamps
         # A scan that comes while its step is already late waits for nothing.
         waited = max(s.due - s.read, 0)
+        sending = s.sent - max(s.start, s.encoded)
         durations = (
-            s.read - sent, waited, max(s.start - max(s.due, s.read), 0), s.decoded - s.start,
-            s.estimated - s.decoded, s.encoded - s.estimated, s.sent - s.encoded,
-            s.sent - s.start, back - sent, back - sent - waited,
+            s.read - sent, waited, max(s.start - max(s.due, s.read), 0), s.decoded - s.begun,
+            s.estimated - s.decoded, s.encoded - s.estimated, sending,
+            s.encoded - s.begun + sending, back - sent, back - sent - waited,
         )  # fmt: skip
         for name, duration in zip(STAGES, durations, strict=True):
             self.stages[name].add(duration)
