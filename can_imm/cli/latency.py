@@ -6,8 +6,9 @@
   can-imm latency --json latency.json --plot latency.png
 
 Sends scans, waits for their manoeuvre frames, and bounces frames off a bare echo node on the same
-bus in between: the floor.  'response' is the whole way less the wait for the next fixed step, and
-is to be compared with the echo; 'processing' is the node's own work.
+bus in between: the floor.  'processing' (the last frame of a scan read to the last frame of its
+answer handed over) and 'response' (the whole way) are less the wait for the next fixed step, and to
+be compared with the echo; 'work' is all that the node does, in that wait or after it.
 """
 
 from __future__ import annotations
@@ -34,6 +35,9 @@ if TYPE_CHECKING:
     from can_imm.types import Scan
 
 CHANNEL = "can-imm-latency"
+
+COMPARED = ("processing", "response", "work")
+"""Stages that are set beside the echo."""
 
 WARM_UP_ROUNDS = 10
 """Rounds before those that count."""
@@ -195,10 +199,9 @@ class _Measurement:
             "stages": stages,
             "echo": echo,
             "ratios": {
-                "processing_p50": ratio("processing", "p50_us"),
-                "processing_p99": ratio("processing", "p99_us"),
-                "response_p50": ratio("response", "p50_us"),
-                "response_p99": ratio("response", "p99_us"),
+                f"{stage}_{quantile}": ratio(stage, f"{quantile}_us")
+                for stage in COMPARED
+                for quantile in ("p50", "p99")
             },
             "lateness": self.probe.lateness.summary(),
             "deadline": {
@@ -244,11 +247,11 @@ def _print(name: str, figures: dict[str, Any]) -> None:
         cells = "".join(f"{value:9.0f}" for value in values.values())
         console.print(f"  {stage.replace('_', ' '):<12}{cells}")
     ratios = figures["ratios"]
-    console.print(
-        f"  processing {ratios['processing_p50']:.2f} of the echo (p99 "
-        f"{ratios['processing_p99']:.2f}), response {ratios['response_p50']:.2f} "
-        f"(p99 {ratios['response_p99']:.2f})"
+    compared = ", ".join(
+        f"{stage} {ratios[f'{stage}_p50']:.2f} (p99 {ratios[f'{stage}_p99']:.2f})"
+        for stage in COMPARED
     )
+    console.print(f"  of the echo: {compared}")
     deadline, memory = figures["deadline"], figures["memory_kib"]
     console.print(f"  {deadline['steps']:,} steps, {deadline['missed']:,} deadlines missed; memory "
                   f"{memory[0]:,} KiB at first, {memory[-1]:,} KiB at last")  # fmt: skip

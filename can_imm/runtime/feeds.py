@@ -23,7 +23,7 @@ LATE_NS = 1000
 GUARD_NS = 2_000_000
 """How long after ``t_k`` [ns] a live step waits for frames that are still on their way."""
 
-REHEARSAL_S = 250e-6
+REHEARSAL_S = 400e-6
 """What a rehearsal may take [s].  What a step needs is in none of the processor's caches after some
 milliseconds of other work, so a live step with frames is rehearsed before it is worked on."""
 

@@ -4,10 +4,10 @@ All stamps are `time.perf_counter_ns`.  A round is one scan: sent, read, answere
 
     sent -receive-> read -wait-> due -late-> start -send-> over
 
--decode-> -estimate-> -encode-> lies in the wait, as far as that is long enough, else before send.
-``processing`` is all that the node does from the scan's last frame on, decode to send, whenever it
-does it; ``response`` is the whole way back to the sender less the wait for the next fixed step,
-which is what a bare echo node's round trip is to be compared with.
+-decode-> -estimate-> -encode-> lies in the wait, as far as that is long enough, else before send;
+``work`` is all that the node does from the scan's last frame on, decode to send, whenever it does
+it.  ``processing`` is the way from read to over, ``response`` the one from sent back to the sender,
+both less the wait for the next fixed step, to be compared with a bare echo node's round trip.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-STAGES = ("receive", "wait", "late", "decode", "estimate", "encode", "send", "processing",
-          "end_to_end", "response")  # fmt: skip
+STAGES = ("receive", "wait", "late", "decode", "estimate", "encode", "send", "work",
+          "processing", "end_to_end", "response")  # fmt: skip
 
 QUANTILES = {"p50_us": 0.5, "p90_us": 0.9, "p99_us": 0.99, "p999_us": 0.999}
 
@@ -278,7 +278,8 @@ class Rounds:
         durations = (
             s.read - sent, waited, max(s.start - max(s.due, s.read), 0), s.decoded - s.begun,
             s.estimated - s.decoded, s.encoded - s.estimated, sending,
-            s.encoded - s.begun + sending, back - sent, back - sent - waited,
+            s.encoded - s.begun + sending, s.sent - s.read - waited, back - sent,
+            back - sent - waited,
         )  # fmt: skip
         for name, duration in zip(STAGES, durations, strict=True):
             self.stages[name].add(duration)
