@@ -12,7 +12,6 @@ both less the wait for the next fixed step, to be compared with a bare echo node
 
 from __future__ import annotations
 
-import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -23,6 +22,7 @@ from can_imm.bus.encoder import OUTPUT_IDS, STATUS_ID
 from can_imm.bus.frame import Frame
 from can_imm.runtime.clock import Clock
 from can_imm.runtime.feeds import FrameSource
+from can_imm.runtime.histogram import Histogram
 from can_imm.runtime.loop import Node, Output, Sink
 
 if TYPE_CHECKING:
@@ -35,55 +35,8 @@ T = TypeVar("T")
 STAGES = ("receive", "wait", "late", "decode", "estimate", "encode", "send", "work",
           "processing", "end_to_end", "response")  # fmt: skip
 
-QUANTILES = {"p50_us": 0.5, "p90_us": 0.9, "p99_us": 0.99, "p999_us": 0.999}
-
-
-class Histogram:
-    """Durations in bins 1 % wide, from 0.1 us to 100 s; constant memory for a run of any length.
-
-    Attributes:
-        counts: entries by bin.
-        max_ns: the longest duration [ns], exactly.
-    """
-
-    LEAST_NS = 100.0
-    _WIDTH = math.log(1.01)
-    BINS = int(math.log(1e11 / LEAST_NS) / _WIDTH) + 1
-
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all entries."""
-        self.counts = [0] * self.BINS
-        self.n = 0
-        self.max_ns = 0
-
-    def add(self, duration_ns: int) -> None:
-        """Enter a duration [ns]."""
-        ratio = max(duration_ns / self.LEAST_NS, 1.0)
-        self.counts[min(int(math.log(ratio) / self._WIDTH), self.BINS - 1)] += 1
-        self.n += 1
-        self.max_ns = max(self.max_ns, duration_ns)
-
-    def quantile_ns(self, q: float) -> float:
-        """Duration [ns] that a fraction ``q`` does not exceed, to 1 %; 0 if there is none."""
-        wanted, seen = q * self.n, 0
-        for i, count in enumerate(self.counts):
-            seen += count
-            if count and seen >= wanted:
-                return min(self.edge_ns(i + 1), float(self.max_ns))
-        return 0.0
-
-    @classmethod
-    def edge_ns(cls, i: int) -> float:
-        """Lower edge of bin ``i`` [ns]."""
-        return cls.LEAST_NS * math.exp(i * cls._WIDTH)
-
-    def summary(self) -> dict[str, float]:
-        """Quantiles and maximum [us]."""
-        values = {name: self.quantile_ns(q) / 1e3 for name, q in QUANTILES.items()}
-        return {**values, "max_us": self.max_ns / 1e3}
+TIMEOUT_S = 1.0
+"""What has not come by then [s] is lost."""
 
 
 class Stamps(NamedTuple):
@@ -106,12 +59,11 @@ class Probe:
     """Stamps a detector node from outside: wrap its source, detector, node and sink.
 
     Attributes:
-        finished: stamps of the latest scans that were answered.
         lateness: of every step's begin.
     """
 
     def __init__(self, clock: Clock, guard_ns: int, sensor_ids: frozenset[int]) -> None:
-        self.finished: deque[Stamps] = deque(maxlen=64)
+        self._finished: deque[Stamps] = deque(maxlen=64)
         self.lateness = Histogram()
         self._clock = clock
         self._guard_ns = guard_ns
@@ -171,11 +123,23 @@ class Probe:
         if frame.id != STATUS_ID:
             self._sent = time.perf_counter_ns()
 
+    def stamps_of(self, sent: int) -> Stamps | None:
+        """Stamps of the scan that was sent at ``sent`` [ns]; they come with the node's next step,
+        which is waited for."""
+        end = time.perf_counter() + TIMEOUT_S
+        while time.perf_counter() < end:
+            while self._finished:
+                stamps = self._finished.popleft()
+                if stamps.read >= sent:
+                    return stamps
+            time.sleep(0.002)
+        return None
+
     def _close(self) -> None:
         """The last frame of a step is known when work on the next one begins."""
         if self._over and self._has_scan:
             self._has_scan = False
-            self.finished.append(
+            self._finished.append(
                 Stamps(self._read, self._due, self._start, self._begun, self._decoded,
                        self._estimated, self._encoded, self._sent)
             )  # fmt: skip
@@ -240,19 +204,23 @@ class _Sink:
 class Rounds:
     """Sends scans and echo requests, waits for the answers, keeps the durations.
 
+    Args:
+        source, sink: its end of the bus.
+        stamps_of: `Probe.stamps_of` of the node.
+
     Attributes:
         stages: `Histogram` by name of `STAGES`.
         echo: round trips of the echo node.
         lost: rounds without a complete answer in time.
     """
 
-    TIMEOUT_S = 1.0
-
-    def __init__(self, source: FrameSource, sink: Sink, probe: Probe) -> None:
+    def __init__(
+        self, source: FrameSource, sink: Sink, stamps_of: Callable[[int], Stamps | None]
+    ) -> None:
         self.stages = {name: Histogram() for name in STAGES}
         self.echo = Histogram()
         self.lost = 0
-        self._source, self._sink, self._probe = source, sink, probe
+        self._source, self._sink, self._stamps_of = source, sink, stamps_of
 
     def reset(self) -> None:
         """Forget all rounds."""
@@ -267,7 +235,7 @@ class Rounds:
         sent = time.perf_counter_ns()
         self._sink.send(frames[-1])
         back = self._wait(OUTPUT_IDS - {STATUS_ID}, answers)
-        stamps = self._stamps(sent)
+        stamps = self._stamps_of(sent)
         if not back or stamps is None:
             self.lost += 1
             return
@@ -296,7 +264,7 @@ class Rounds:
 
     def _wait(self, ids: frozenset[int], count: int) -> int:
         """When the last of ``count`` frames arrived [ns], 0 after the timeout."""
-        end = time.perf_counter() + self.TIMEOUT_S
+        end = time.perf_counter() + TIMEOUT_S
         while (left := end - time.perf_counter()) > 0:
             frame = self._source.recv(left)
             now = time.perf_counter_ns()
@@ -305,15 +273,3 @@ class Rounds:
                 if count == 0:
                     return now
         return 0
-
-    def _stamps(self, sent: int) -> Stamps | None:
-        """Stamps of the scan that was sent at ``sent``; they come with the node's next step."""
-        end = time.perf_counter() + self.TIMEOUT_S
-        finished = self._probe.finished
-        while time.perf_counter() < end:
-            while finished:
-                stamps = finished.popleft()
-                if stamps.read >= sent:
-                    return stamps
-            time.sleep(0.002)
-        return None

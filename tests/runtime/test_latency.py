@@ -13,7 +13,8 @@ from can_imm.bus.encoder import OUTPUT_IDS, STATUS_ID
 from can_imm.bus.frame import Frame
 from can_imm.cli.main import main
 from can_imm.runtime import latency
-from can_imm.runtime.latency import STAGES, Histogram, Probe, Rounds
+from can_imm.runtime.histogram import Histogram
+from can_imm.runtime.latency import STAGES, Probe, Rounds
 
 
 @given(st.lists(st.integers(100, 10**10), min_size=1), st.sampled_from([0.5, 0.9, 0.99, 1.0]))
@@ -135,7 +136,7 @@ def test_every_stage_is_measured_where_it_happens(monkeypatch, ahead, measured):
             node.now = 23_000
             return Frame(0, Node.ANSWER, b"")
 
-    rounds = Rounds(Bus(), Bus(), node.probe)
+    rounds = Rounds(Bus(), Bus(), node.probe.stamps_of)
     rounds.scan(list(node.frames), 1)
     assert rounds.lost == 0
     assert {name: rounds.stages[name].max_ns for name in STAGES} == {
@@ -148,7 +149,7 @@ def test_every_stage_is_measured_where_it_happens(monkeypatch, ahead, measured):
 
 def test_a_round_without_an_answer_is_lost(monkeypatch):
     node = Node(monkeypatch)
-    monkeypatch.setattr(Rounds, "TIMEOUT_S", 0.01)
+    monkeypatch.setattr(latency, "TIMEOUT_S", 0.01)
 
     class Bus:
         def send(self, frame):
@@ -157,7 +158,7 @@ def test_a_round_without_an_answer_is_lost(monkeypatch):
         def recv(self, timeout_s):
             return None
 
-    rounds = Rounds(Bus(), Bus(), node.probe)
+    rounds = Rounds(Bus(), Bus(), node.probe.stamps_of)
     rounds.scan(node.frames, 1)
     rounds.bounce()
     assert rounds.lost == 2
