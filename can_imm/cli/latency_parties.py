@@ -110,11 +110,13 @@ class Subject:
             try:
                 while not done.is_set():
                     self._loop.step()
-            except BaseException as error:  # the main thread raises it
+            except BaseException as error:  # for the main thread to raise
                 self._failure = error
 
         with _thread(step_forever, done):
             yield
+        if self._failure is not None:
+            raise self._failure
 
     def stamps_of(self, sent: int) -> Stamps | None:
         if self._failure is not None:
