@@ -208,8 +208,9 @@ class _RemoteWitness:
 
 def _echo_process(args: argparse.Namespace) -> None:
     _begin_process(args)
+    parent = multiprocessing.parent_process()
     with suppress(CanImmError), open_bus_from(args) as bus:  # the peer tells what is wrong with it
-        while True:
+        while parent is not None and parent.is_alive():
             answer_echoes(bus, 1.0)
 
 
@@ -217,12 +218,13 @@ def _peer_process(
     args: argparse.Namespace, connection: Connection, n_objects: int, duration_s: float
 ) -> None:
     _begin_process(args)
-    try:
-        with open_bus_from(args) as bus:
-            witness = _RemoteWitness(connection)
-            connection.send(_as_peer(bus, witness, n_objects, duration_s))
-    except CanImmError as error:
-        connection.send(error)
+    with suppress(EOFError, BrokenPipeError):  # the parent is gone
+        try:
+            with open_bus_from(args) as bus:
+                witness = _RemoteWitness(connection)
+                connection.send(_as_peer(bus, witness, n_objects, duration_s))
+        except CanImmError as error:
+            connection.send(error)
 
 
 def _begin_process(args: argparse.Namespace) -> None:
