@@ -8,6 +8,7 @@ from typing import Any
 
 import can
 from can.cli import create_bus_from_namespace
+from can.interfaces.virtual import VirtualBus
 from can.util import load_config
 
 from can_imm.bus.errors import one_line
@@ -50,6 +51,11 @@ def open_bus_from_namespace(
         lambda: create_bus_from_namespace(namespace, prefix=prefix, **settings),
         {**settings, **given},
     )
+
+
+def in_one_process(bus: can.BusABC) -> bool:
+    """Whether the bus reaches no further than this process."""
+    return isinstance(bus, VirtualBus)
 
 
 def _defaults(given: dict[str, Any]) -> dict[str, Any]:

@@ -6,16 +6,15 @@
   can-imm latency --json latency.json --plot latency.png
 
 Sends scans, waits for their manoeuvre frames, and bounces frames off a bare echo node on the same
-bus in between: the floor.  'response' is the whole way less the wait for the next fixed step, and
-is to be compared with the echo; 'processing' is the node's own work.
+bus in between: the floor.  'processing' (the last frame of a scan read to the last frame of its
+answer handed over) and 'response' (the whole way) are less the wait for the next fixed step, and to
+be compared with the echo; 'work' is all that the node does, in that wait or after it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import threading
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,18 +24,14 @@ from can_imm.cli.compiling import announced
 from can_imm.cli.detection import positive_int
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import can
 
-    from can_imm.runtime.health import Health
-    from can_imm.runtime.latency import Probe, Rounds
-    from can_imm.types import Scan
+    from can_imm.cli.latency_parties import Measured, Subject
 
 CHANNEL = "can-imm-latency"
 
-WARM_UP_ROUNDS = 10
-"""Rounds before those that count."""
+COMPARED = ("processing", "response", "work")
+"""Stages that are set beside the echo."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,21 +59,33 @@ def run(args: argparse.Namespace) -> int:
         raise CanImmError(f"--duration {args.duration:g}: must be above 0")
     if args.objects > 64:
         raise CanImmError(f"--objects {args.objects}: the sensor's messages have room for 64")
+    from can_imm.bus.buses import in_one_process
+    from can_imm.cli.latency_parties import Subject, measure_in_processes, measure_in_threads
+    from can_imm.detector import Detector
+    from can_imm.manoeuvres import load_bank
+    from can_imm.runtime import realtime
+
     with ExitStack() as stack:
-        buses = [stack.enter_context(_open(args)) for _ in range(3)]
-        name = bus_name(args, buses[0])
+        bus = stack.enter_context(_open(args))
         with announced():
-            measurement = _Measurement(args, buses)
-        measurement.run()
-    figures = measurement.figures()
-    _print(name, figures)
+            detector = Detector(load_bank(args.preset))
+        subject = Subject(bus, detector, wants_realtime=args.realtime, duration_s=args.duration)
+        if args.realtime:
+            realtime.ask_process()
+        stack.enter_context(subject.running())
+        if not in_one_process(bus):
+            measured = measure_in_processes(subject, args, args.objects, args.duration)
+        else:
+            peer_bus, echo_bus = (stack.enter_context(_open(args)) for _ in range(2))
+            measured = measure_in_threads(subject, peer_bus, echo_bus, args.objects, args.duration)
+    figures = _figures(subject, measured)
+    _print(bus_name(args, bus), figures)
     if args.json:
         Path(args.json).write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     if args.plot:
         from can_imm.plots.latency import latency_figure
 
-        rounds = measurement.rounds
-        latency_figure(Path(args.plot), {**rounds.stages, "echo": rounds.echo})
+        latency_figure(Path(args.plot), {**measured.stages, "echo": measured.echo})
     return 0
 
 
@@ -90,146 +97,28 @@ def _open(args: argparse.Namespace) -> can.BusABC:
     return open_bus("virtual", CHANNEL)
 
 
-class _Measurement:
-    """A sender in this thread, a detector and an echo node in two others, each on its own bus."""
+def _figures(subject: Subject, measured: Measured) -> dict[str, Any]:
+    """As in the JSON file."""
+    echo = measured.echo.summary()
+    stages = {name: histogram.summary() for name, histogram in measured.stages.items()}
 
-    def __init__(self, args: argparse.Namespace, buses: list[can.BusABC]) -> None:
-        from can_imm.bus.decoder import ScanDecoder
-        from can_imm.bus.encoder import ManoeuvreEncoder, RadarEncoder
-        from can_imm.bus.profile import load_profile
-        from can_imm.bus.sinks import BusSink
-        from can_imm.bus.sources import BusSource
-        from can_imm.detector import Detector
-        from can_imm.manoeuvres import load_bank
-        from can_imm.runtime.clock import WallClock
-        from can_imm.runtime.echo import EchoFilter
-        from can_imm.runtime.feeds import BusFeed
-        from can_imm.runtime.health import Health
-        from can_imm.runtime.latency import Probe, Rounds
-        from can_imm.runtime.loop import Loop
-        from can_imm.runtime.nodes import DetectorNode
+    def ratio(stage: str, quantile: str) -> float:
+        return stages[stage][quantile] / echo[quantile] if echo[quantile] else 0.0
 
-        self._duration_s: float = args.duration
-        self._realtime: bool = args.realtime
-        self._objects: int = args.objects
-        self._encoder = RadarEncoder()
-        own, theirs, self._echo_bus = buses
-        self.health: Health = Health()
-        clock = WallClock()
-        decoder = ScanDecoder(load_profile("can_imm"))
-        detector = Detector(load_bank(args.preset))
-        ends = EchoFilter(BusSource(theirs), BusSink(theirs), self.health)
-        # the feed needs the probe's source, the probe the feed's guard
-        guard_ns = BusFeed(ends, clock, self.health).guard_ns
-        self.probe: Probe = Probe(clock, guard_ns, decoder.ids)
-        feed = BusFeed(self.probe.source(ends), clock, self.health, guard_ns)
-        node = DetectorNode(decoder, self.probe.detector(detector), ManoeuvreEncoder(), self.health)
-        self._loop = Loop(feed, self.probe.node(node), self.health, [self.probe.sink(ends)])
-        self.rounds: Rounds = Rounds(BusSource(own), BusSink(own), self.probe)
-        self._done = threading.Event()
-        self._failure: BaseException | None = None
-        self._granted: dict[str, Any] = {}
-        self._memory: list[int] = []
-        self._before = 0, 0
-
-    def run(self) -> None:
-        """Measure until the time is over."""
-        import numpy as np
-
-        from can_imm.bus.echo import answer_echoes
-        from can_imm.runtime import realtime
-        from can_imm.types import Scan
-
-        if self._realtime:
-            realtime.ask_process()
-        threads = [
-            self._thread(self._step_forever),
-            self._thread(lambda: self._until_done(lambda: answer_echoes(self._echo_bus, 0.1))),
-        ]
-        rng = np.random.default_rng(0)
-        scan = Scan(self._objects)
-        scan.n = self._objects
-        scan.ids[:] = range(self._objects)
-        scan.valid[:] = True
-        scan.z[:] = [40.0, 0.0, 0.0, 0.0]
-        self._warm_up(scan)
-        began = time.monotonic()
-        sample_s = self._duration_s / 20
-        try:
-            while (now := time.monotonic() - began) < self._duration_s and self._failure is None:
-                # at any phase of the step
-                time.sleep(0.01 + 0.01 * rng.random())
-                frames = self._encoder.encode(scan, time.time_ns() // 1000 * 1000)
-                self.rounds.scan(frames, 2 * self._objects)
-                self.rounds.bounce()
-                if now >= len(self._memory) * sample_s:
-                    self._memory.append(realtime.resident_kib())
-        finally:
-            self._done.set()
-            for thread in threads:
-                thread.join()
-        self._memory.append(realtime.resident_kib())
-        if self._failure is not None:
-            raise self._failure
-
-    def _warm_up(self, scan: Scan) -> None:
-        """Let everything happen once, threads and tracks begin; then count from zero."""
-        for _ in range(WARM_UP_ROUNDS):
-            frames = self._encoder.encode(scan, time.time_ns() // 1000 * 1000)
-            self.rounds.scan(frames, 2 * self._objects)
-            self.rounds.bounce()
-        self.rounds.reset()
-        self.probe.lateness.reset()
-        self._before = self.health.steps, self.health.deadline_misses
-
-    def figures(self) -> dict[str, Any]:
-        """As in the JSON file."""
-        rounds, health = self.rounds, self.health
-        echo = rounds.echo.summary()
-        stages = {name: histogram.summary() for name, histogram in rounds.stages.items()}
-
-        def ratio(stage: str, quantile: str) -> float:
-            return stages[stage][quantile] / echo[quantile] if echo[quantile] else 0.0
-
-        return {
-            "stages": stages,
-            "echo": echo,
-            "ratios": {
-                "processing_p50": ratio("processing", "p50_us"),
-                "processing_p99": ratio("processing", "p99_us"),
-                "response_p50": ratio("response", "p50_us"),
-                "response_p99": ratio("response", "p99_us"),
-            },
-            "lateness": self.probe.lateness.summary(),
-            "deadline": {
-                "steps": health.steps - self._before[0],
-                "missed": health.deadline_misses - self._before[1],
-            },
-            "rounds": {"answered": rounds.stages["end_to_end"].n, "lost": rounds.lost},
-            "memory_kib": self._memory,
-            "granted": self._granted,
-        }
-
-    def _step_forever(self) -> None:
-        from can_imm.runtime import realtime
-
-        if self._realtime:
-            realtime.ask_thread()
-        self._granted = realtime.granted()
-        self._until_done(self._loop.step)
-
-    def _until_done(self, work: Callable[[], object]) -> None:
-        try:
-            while not self._done.is_set():
-                work()
-        except BaseException as error:  # the main thread raises it
-            self._failure = error
-
-    @staticmethod
-    def _thread(target: Callable[[], None]) -> threading.Thread:
-        thread = threading.Thread(target=target, daemon=True)
-        thread.start()
-        return thread
+    return {
+        "stages": stages,
+        "echo": echo,
+        "ratios": {
+            f"{stage}_{quantile}": ratio(stage, f"{quantile}_us")
+            for stage in COMPARED
+            for quantile in ("p50", "p99")
+        },
+        "lateness": subject.probe.lateness.summary(),
+        "deadline": subject.deadline(),
+        "rounds": {"answered": measured.stages["end_to_end"].n, "lost": measured.lost},
+        "memory_kib": subject.memory_kib,
+        "granted": subject.granted,
+    }
 
 
 def _print(name: str, figures: dict[str, Any]) -> None:
@@ -244,11 +133,11 @@ def _print(name: str, figures: dict[str, Any]) -> None:
         cells = "".join(f"{value:9.0f}" for value in values.values())
         console.print(f"  {stage.replace('_', ' '):<12}{cells}")
     ratios = figures["ratios"]
-    console.print(
-        f"  processing {ratios['processing_p50']:.2f} of the echo (p99 "
-        f"{ratios['processing_p99']:.2f}), response {ratios['response_p50']:.2f} "
-        f"(p99 {ratios['response_p99']:.2f})"
+    compared = ", ".join(
+        f"{stage} {ratios[f'{stage}_p50']:.2f} (p99 {ratios[f'{stage}_p99']:.2f})"
+        for stage in COMPARED
     )
+    console.print(f"  of the echo: {compared}")
     deadline, memory = figures["deadline"], figures["memory_kib"]
     console.print(f"  {deadline['steps']:,} steps, {deadline['missed']:,} deadlines missed; memory "
                   f"{memory[0]:,} KiB at first, {memory[-1]:,} KiB at last")  # fmt: skip

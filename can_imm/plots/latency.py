@@ -13,7 +13,7 @@ from can_imm.plots.style import BAR, STYLE
 
 
 class Distribution(Protocol):
-    """A histogram of durations, as `can_imm.runtime.latency.Histogram`."""
+    """A histogram of durations, as `can_imm.runtime.histogram.Histogram`."""
 
     counts: list[int]
     n: int

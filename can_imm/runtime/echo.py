@@ -7,7 +7,7 @@ from collections import deque
 from can_imm.bus.frame import Frame
 from can_imm.runtime.feeds import FrameSource
 from can_imm.runtime.health import Health
-from can_imm.runtime.loop import Sink
+from can_imm.runtime.loop import Output
 
 REMEMBERED = 1024
 
@@ -19,7 +19,7 @@ class EchoFilter:
     frame has been recorded when it was sent; it is counted here and goes no further.
     """
 
-    def __init__(self, source: FrameSource, sink: Sink, health: Health) -> None:
+    def __init__(self, source: FrameSource, sink: Output, health: Health) -> None:
         self._source = source
         self._sink = sink
         self._health = health
@@ -30,6 +30,9 @@ class EchoFilter:
         self._ids.add(frame.id)
         self._sent.append((frame.id, frame.data))
         self._sink.send(frame)
+
+    def rehearse(self, frame: Frame) -> None:
+        self._sink.rehearse(frame)
 
     def recv(self, timeout_s: float) -> Frame | None:
         while True:

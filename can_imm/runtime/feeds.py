@@ -23,15 +23,18 @@ LATE_NS = 1000
 GUARD_NS = 2_000_000
 """How long after ``t_k`` [ns] a live step waits for frames that are still on their way."""
 
+REHEARSAL_S = 400e-6
+"""What a rehearsal may take [s].  What a step needs is in none of the processor's caches after some
+milliseconds of other work, so a live step with frames is rehearsed before it is worked on."""
 
-REHEARSE_S = 600e-6
-"""So long before a live step with frames [s] it is rehearsed: what a step needs is in none of the
-processor's caches after some milliseconds of other work."""
+FRAME_S = 25e-6
+"""What it takes about, frame by frame, to do what can be done of a step before it is due [s]."""
 
-AWAKE_S = 80e-6
-"""So long before such a step [s] the loop stops sleeping, for waking up takes that time."""
+AWAKE_S = 150e-6
+"""So long before it has something to do the loop stops sleeping [s], for waking up takes time."""
 
-Rehearsal = Callable[[int, list[Frame]], None]
+Ahead = Callable[[int, list[Frame]], None]
+"""Work before a step is due: called with the step's time [ns] and its frames up to now."""
 
 
 def _nothing(t_ns: int, frames: list[Frame]) -> None:
@@ -41,13 +44,15 @@ def _nothing(t_ns: int, frames: list[Frame]) -> None:
 class Feed(Protocol):
     """Frames for a loop, step by step.
 
-    ``rehearse``, set by the loop, is called before the first step, and shortly before a live step
-    that has frames, with these.
+    ``rehearse`` and ``prepare``, set by the loop, are called shortly before a live step that has
+    frames: first the rehearsal, if there is time (one is also called before the first step), then
+    what does as much of the step as these frames allow; that again when more frames come.
     """
 
     clock: Clock
     guard_ns: int
-    rehearse: Rehearsal
+    rehearse: Ahead
+    prepare: Ahead
 
     def start_ns(self, step_ns: int) -> int:
         """Return the time of the first step [ns], a multiple of ``step_ns``; called once."""
@@ -85,7 +90,8 @@ class BusFeed:
         self, source: FrameSource, clock: Clock, health: Health, guard_ns: int = GUARD_NS
     ) -> None:
         self.clock = clock
-        self.rehearse: Rehearsal = _nothing
+        self.rehearse: Ahead = _nothing
+        self.prepare: Ahead = _nothing
         self._source = source
         self._health = health
         self.guard_ns = guard_ns
@@ -101,18 +107,24 @@ class BusFeed:
 
     def collect(self, t_ns: int) -> list[Frame]:
         due_ns = t_ns + self.guard_ns
-        rehearsed = False
+        prepared = 0
         while True:
             remaining_s = timeout_s = self.clock.remaining_s(due_ns)
-            if self._pending and self._pending[0].t_ns <= t_ns:
-                if rehearsed:
-                    timeout_s -= AWAKE_S
-                elif remaining_s > REHEARSE_S:
-                    timeout_s -= REHEARSE_S
-                elif remaining_s > 2 * AWAKE_S:
-                    rehearsed = True
-                    self.rehearse(t_ns, list(self._pending))
+            if remaining_s > 0 and self._pending and self._pending[0].t_ns <= t_ns:
+                ahead_s = AWAKE_S
+                if prepared < len(self._pending):
+                    ahead_s += REHEARSAL_S + FRAME_S * len(self._pending)
+                if remaining_s > ahead_s:
+                    timeout_s -= ahead_s
+                elif prepared < len(self._pending):
+                    mine = [frame for frame in self._pending if frame.t_ns <= t_ns]
+                    if not prepared and remaining_s > REHEARSAL_S:
+                        self.rehearse(t_ns, mine)
+                    self.prepare(t_ns, mine)
+                    prepared = len(self._pending)
                     continue
+                else:
+                    timeout_s = 0.0
             frame = self._source.recv(max(timeout_s, 0.0))
             if frame is None:
                 if remaining_s <= 0:
@@ -172,7 +184,8 @@ class LogFeed:
         replaced: frozenset[int] = frozenset(),
     ) -> None:
         self.clock = clock
-        self.rehearse: Rehearsal = _nothing
+        self.rehearse: Ahead = _nothing
+        self.prepare: Ahead = _nothing
         self.guard_ns = 0
         self.n_replaced = 0
         self._frames = iter(frames)
@@ -227,7 +240,8 @@ class IdleFeed:
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
-        self.rehearse: Rehearsal = _nothing
+        self.rehearse: Ahead = _nothing
+        self.prepare: Ahead = _nothing
         self.guard_ns = 0
 
     def start_ns(self, step_ns: int) -> int:

@@ -2,91 +2,53 @@
 
 All stamps are `time.perf_counter_ns`.  A round is one scan: sent, read, answered, handed over::
 
-    sent -receive-> read -wait-> due -late-> start -decode-> -estimate-> -encode-> -send-> over
+    sent -receive-> read -wait-> due -late-> start -send-> over
 
-``processing`` is decode to send; ``response`` is the whole way back to the sender less the wait for
-the next fixed step, which is what a bare echo node's round trip is to be compared with.
+-decode-> -estimate-> -encode-> lies in the wait, as far as that is long enough, else before send;
+``work`` is all that the node does from the scan's last frame on, decode to send, whenever it does
+it.  ``processing`` is the way from read to over, ``response`` the one from sent back to the sender,
+both less the wait for the next fixed step, to be compared with a bare echo node's round trip.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from collections import deque
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from can_imm.bus.echo import ECHO_ANSWER, ECHO_REQUEST
 from can_imm.bus.encoder import OUTPUT_IDS, STATUS_ID
 from can_imm.bus.frame import Frame
 from can_imm.runtime.clock import Clock
-from can_imm.runtime.feeds import FrameSource, Rehearsal
-from can_imm.runtime.loop import Node, Sink
+from can_imm.runtime.feeds import FrameSource
+from can_imm.runtime.histogram import Histogram
+from can_imm.runtime.loop import Node, Output, Sink
 
 if TYPE_CHECKING:
     from can_imm.detector import Detector
+    from can_imm.runtime.nodes import DetectorNode
     from can_imm.types import Scan
 
-STAGES = ("receive", "wait", "late", "decode", "estimate", "encode", "send", "processing",
-          "end_to_end", "response")  # fmt: skip
+T = TypeVar("T")
 
-QUANTILES = {"p50_us": 0.5, "p90_us": 0.9, "p99_us": 0.99, "p999_us": 0.999}
+STAGES = ("receive", "wait", "late", "decode", "estimate", "encode", "send", "work",
+          "processing", "end_to_end", "response")  # fmt: skip
 
-
-class Histogram:
-    """Durations in bins 1 % wide, from 0.1 us to 100 s; constant memory for a run of any length.
-
-    Attributes:
-        counts: entries by bin.
-        max_ns: the longest duration [ns], exactly.
-    """
-
-    LEAST_NS = 100.0
-    _WIDTH = math.log(1.01)
-    BINS = int(math.log(1e11 / LEAST_NS) / _WIDTH) + 1
-
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all entries."""
-        self.counts = [0] * self.BINS
-        self.n = 0
-        self.max_ns = 0
-
-    def add(self, duration_ns: int) -> None:
-        """Enter a duration [ns]."""
-        ratio = max(duration_ns / self.LEAST_NS, 1.0)
-        self.counts[min(int(math.log(ratio) / self._WIDTH), self.BINS - 1)] += 1
-        self.n += 1
-        self.max_ns = max(self.max_ns, duration_ns)
-
-    def quantile_ns(self, q: float) -> float:
-        """Duration [ns] that a fraction ``q`` does not exceed, to 1 %; 0 if there is none."""
-        wanted, seen = q * self.n, 0
-        for i, count in enumerate(self.counts):
-            seen += count
-            if count and seen >= wanted:
-                return min(self.edge_ns(i + 1), float(self.max_ns))
-        return 0.0
-
-    @classmethod
-    def edge_ns(cls, i: int) -> float:
-        """Lower edge of bin ``i`` [ns]."""
-        return cls.LEAST_NS * math.exp(i * cls._WIDTH)
-
-    def summary(self) -> dict[str, float]:
-        """Quantiles and maximum [us]."""
-        values = {name: self.quantile_ns(q) / 1e3 for name, q in QUANTILES.items()}
-        return {**values, "max_us": self.max_ns / 1e3}
+TIMEOUT_S = 1.0
+"""What has not come by then [s] is lost."""
 
 
 class Stamps(NamedTuple):
-    """When what happened to one scan in the node [ns]."""
+    """When what happened to one scan in the node [ns].
+
+    ``start`` is the begin of the step, ``begun`` of the work on the scan, which may be earlier.
+    """
 
     read: int
     due: int
     start: int
+    begun: int
     decoded: int
     estimated: int
     encoded: int
@@ -97,19 +59,18 @@ class Probe:
     """Stamps a detector node from outside: wrap its source, detector, node and sink.
 
     Attributes:
-        finished: stamps of the latest scans that were answered.
         lateness: of every step's begin.
     """
 
     def __init__(self, clock: Clock, guard_ns: int, sensor_ids: frozenset[int]) -> None:
-        self.finished: deque[Stamps] = deque(maxlen=64)
+        self._finished: deque[Stamps] = deque(maxlen=64)
         self.lateness = Histogram()
         self._clock = clock
         self._guard_ns = guard_ns
         self._sensor_ids = sensor_ids
-        self._read = self._due = self._start = self._decoded = self._estimated = 0
-        self._encoded = self._sent = 0
-        self._has_scan = False
+        self._latest_read = self._read = self._due = self._start = self._sent = 0
+        self._begun = self._decoded = self._estimated = self._encoded = 0
+        self._has_scan = self._over = False
 
     def source(self, source: FrameSource) -> FrameSource:
         """Stamp the sensor's frames when they are read."""
@@ -119,17 +80,26 @@ class Probe:
         """Stamp begin and end of the detector's work; everything else passes through."""
         return _Detector(self, detector)
 
-    def node(self, node: Node) -> Node:
-        """Stamp begin and end of a step."""
+    def node(self, node: DetectorNode) -> Node:
+        """Stamp begin and end of a step, and of what is done ahead of it."""
         return _Node(self, node)
 
-    def sink(self, sink: Sink) -> Sink:
+    def sink(self, sink: Output) -> Output:
         """Stamp every frame that was handed over."""
         return _Sink(self, sink)
 
     def frame_read(self, frame: Frame) -> None:
         if frame.id in self._sensor_ids:
-            self._read = time.perf_counter_ns()
+            self._latest_read = time.perf_counter_ns()
+
+    def work(self, part: Callable[[int, list[Frame]], T], t_ns: int, frames: list[Frame]) -> T:
+        """Let the node do a part of a step."""
+        self._close()
+        had_scan, begun = self._has_scan, time.perf_counter_ns()
+        result = part(t_ns, frames)
+        if self._has_scan and not had_scan:
+            self._begun, self._encoded = begun, time.perf_counter_ns()
+        return result
 
     def step_begins(self, t_ns: int) -> None:
         self._close()
@@ -138,27 +108,42 @@ class Probe:
         self._due = self._start - late_ns
         self.lateness.add(late_ns)
 
+    def step_ends(self) -> None:
+        self._over = True
+
     def detector_begins(self, scan: Scan | None) -> None:
-        self._has_scan = scan is not None
-        self._decoded = time.perf_counter_ns()
+        if scan is not None:
+            self._has_scan = True
+            self._read, self._decoded = self._latest_read, time.perf_counter_ns()
 
     def detector_ends(self) -> None:
         self._estimated = time.perf_counter_ns()
 
-    def step_ends(self) -> None:
-        self._encoded = time.perf_counter_ns()
+    def frame_sent(self, frame: Frame) -> None:
+        if frame.id != STATUS_ID:
+            self._sent = time.perf_counter_ns()
 
-    def frame_sent(self) -> None:
-        self._sent = time.perf_counter_ns()
+    def stamps_of(self, sent: int) -> Stamps | None:
+        """Stamps of the scan that was sent at ``sent`` [ns]; they come with the node's next step,
+        which is waited for."""
+        end = time.perf_counter() + TIMEOUT_S
+        while time.perf_counter() < end:
+            while self._finished:
+                stamps = self._finished.popleft()
+                if stamps.read >= sent:
+                    return stamps
+            time.sleep(0.002)
+        return None
 
     def _close(self) -> None:
-        """The last frame of a step is known when the next step begins."""
-        if self._has_scan:
+        """The last frame of a step is known when work on the next one begins."""
+        if self._over and self._has_scan:
             self._has_scan = False
-            self.finished.append(
-                Stamps(self._read, self._due, self._start, self._decoded, self._estimated,
-                       self._encoded, self._sent)
+            self._finished.append(
+                Stamps(self._read, self._due, self._start, self._begun, self._decoded,
+                       self._estimated, self._encoded, self._sent)
             )  # fmt: skip
+        self._over = False
 
 
 class _Source:
@@ -192,32 +177,36 @@ class _Detector:
 
 
 class _Node:
-    def __init__(self, probe: Probe, node: Node) -> None:
+    def __init__(self, probe: Probe, node: DetectorNode) -> None:
         self._probe, self._node = probe, node
+        self.rehearse = node.rehearse
 
-    def rehearse(self, t_ns: int, frames: list[Frame]) -> None:
-        rehearse: Rehearsal | None = getattr(self._node, "rehearse", None)
-        if rehearse is not None:
-            rehearse(t_ns, frames)
+    def prepare(self, t_ns: int, frames: list[Frame]) -> None:
+        self._probe.work(self._node.prepare, t_ns, frames)
 
     def step(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
         self._probe.step_begins(t_ns)
-        answers = self._node.step(t_ns, frames)
+        answers = self._probe.work(self._node.step, t_ns, frames)
         self._probe.step_ends()
         return answers
 
 
 class _Sink:
-    def __init__(self, probe: Probe, sink: Sink) -> None:
+    def __init__(self, probe: Probe, sink: Output) -> None:
         self._probe, self._sink = probe, sink
+        self.rehearse = sink.rehearse
 
     def send(self, frame: Frame) -> None:
         self._sink.send(frame)
-        self._probe.frame_sent()
+        self._probe.frame_sent(frame)
 
 
 class Rounds:
     """Sends scans and echo requests, waits for the answers, keeps the durations.
+
+    Args:
+        source, sink: its end of the bus.
+        stamps_of: `Probe.stamps_of` of the node.
 
     Attributes:
         stages: `Histogram` by name of `STAGES`.
@@ -225,13 +214,13 @@ class Rounds:
         lost: rounds without a complete answer in time.
     """
 
-    TIMEOUT_S = 1.0
-
-    def __init__(self, source: FrameSource, sink: Sink, probe: Probe) -> None:
+    def __init__(
+        self, source: FrameSource, sink: Sink, stamps_of: Callable[[int], Stamps | None]
+    ) -> None:
         self.stages = {name: Histogram() for name in STAGES}
         self.echo = Histogram()
         self.lost = 0
-        self._source, self._sink, self._probe = source, sink, probe
+        self._source, self._sink, self._stamps_of = source, sink, stamps_of
 
     def reset(self) -> None:
         """Forget all rounds."""
@@ -246,17 +235,19 @@ class Rounds:
         sent = time.perf_counter_ns()
         self._sink.send(frames[-1])
         back = self._wait(OUTPUT_IDS - {STATUS_ID}, answers)
-        stamps = self._stamps(sent)
+        stamps = self._stamps_of(sent)
         if not back or stamps is None:
             self.lost += 1
             return
         s = stamps
         # A scan that comes while its step is already late waits for nothing.
         waited = max(s.due - s.read, 0)
+        sending = s.sent - max(s.start, s.encoded)
         durations = (
-            s.read - sent, waited, max(s.start - max(s.due, s.read), 0), s.decoded - s.start,
-            s.estimated - s.decoded, s.encoded - s.estimated, s.sent - s.encoded,
-            s.sent - s.start, back - sent, back - sent - waited,
+            s.read - sent, waited, max(s.start - max(s.due, s.read), 0), s.decoded - s.begun,
+            s.estimated - s.decoded, s.encoded - s.estimated, sending,
+            s.encoded - s.begun + sending, s.sent - s.read - waited, back - sent,
+            back - sent - waited,
         )  # fmt: skip
         for name, duration in zip(STAGES, durations, strict=True):
             self.stages[name].add(duration)
@@ -273,7 +264,7 @@ class Rounds:
 
     def _wait(self, ids: frozenset[int], count: int) -> int:
         """When the last of ``count`` frames arrived [ns], 0 after the timeout."""
-        end = time.perf_counter() + self.TIMEOUT_S
+        end = time.perf_counter() + TIMEOUT_S
         while (left := end - time.perf_counter()) > 0:
             frame = self._source.recv(left)
             now = time.perf_counter_ns()
@@ -282,15 +273,3 @@ class Rounds:
                 if count == 0:
                     return now
         return 0
-
-    def _stamps(self, sent: int) -> Stamps | None:
-        """Stamps of the scan that was sent at ``sent``; they come with the node's next step."""
-        end = time.perf_counter() + self.TIMEOUT_S
-        finished = self._probe.finished
-        while time.perf_counter() < end:
-            while finished:
-                stamps = finished.popleft()
-                if stamps.read >= sent:
-                    return stamps
-            time.sleep(0.002)
-        return None

@@ -33,6 +33,13 @@ class Sink(Protocol):
         """Take one frame; trouble is counted by the sink, not raised."""
 
 
+class Output(Sink, Protocol):
+    """A sink whose frames somebody waits for: a bus."""
+
+    def rehearse(self, frame: Frame) -> None:
+        """Do what is done to send a frame, as far as nobody notices."""
+
+
 class Loop:
     """A node's life in steps of `STEP_NS`.
 
@@ -49,13 +56,16 @@ class Loop:
         feed: Feed,
         node: Node,
         health: Health,
-        outputs: Sequence[Sink] = (),
+        outputs: Sequence[Output] = (),
         recorders: Sequence[Sink] = (),
     ) -> None:
         self._feed = feed
         self._node = node
-        # not every node has something to rehearse
-        feed.rehearse = getattr(node, "rehearse", feed.rehearse)
+        # not every node has something to do before a step is due
+        feed.prepare = getattr(node, "prepare", feed.prepare)
+        self._rehearse_node = getattr(node, "rehearse", None)
+        if self._rehearse_node is not None:
+            feed.rehearse = self._rehearse
         self._health = health
         self._outputs = outputs
         self._recorders = recorders
@@ -88,10 +98,17 @@ class Loop:
             self._send([], answers)
             self._health.sent += len(answers)
 
+    def _rehearse(self, t_ns: int, frames: list[Frame]) -> None:
+        """Do a step that leaves no trace, and all but send the answers."""
+        assert self._rehearse_node is not None
+        for frame in self._rehearse_node(t_ns, frames):
+            for output in self._outputs:
+                output.rehearse(frame)
+
     def _send(self, frames: list[Frame], answers: list[Frame]) -> None:
-        for sink in self._outputs:
+        for output in self._outputs:
             for frame in answers:
-                sink.send(frame)
+                output.send(frame)
         for sink in self._recorders:
             for frame in frames:
                 sink.send(frame)

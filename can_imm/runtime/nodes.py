@@ -23,7 +23,7 @@ SENSOR_TIMEOUT_NS = 1_000_000_000
 """After so long without a scan [ns] the heartbeat says that there is no sensor."""
 
 MAX_WAITING = 8
-"""Scans that may wait for their step when several come at once."""
+"""Scans that are kept when several come at once: one for this step, one for each of the next."""
 
 REHEARSED = 4
 """So many frames of a step are rehearsed."""
@@ -143,7 +143,12 @@ class DetectorNode:
         self._health = health
         self._listeners = listeners
         self._understudy: DetectorNode | None = None
-        self._waiting = Waiting([Scan(capacity) for _ in range(MAX_WAITING)])
+        # of the step that is being prepared: frames taken in, reports of its scan, their frames
+        self._taken = 0
+        self._reported: int | None = None
+        self._answers: list[Frame] = []
+        # the first of several scans need not wait
+        self._waiting = Waiting([Scan(capacity) for _ in range(MAX_WAITING - 1)])
         # answers go where the sensor's frames came from
         self._channel: str | None = None
         self._seen_ns: int | None = None
@@ -155,23 +160,14 @@ class DetectorNode:
         return self._waiting.dropped
 
     def step(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
-        for frame in frames:
-            scan = self.decoder.feed(frame)
-            if scan is not None:
-                self._channel = frame.channel
-                self._waiting.put(scan)
-        self._waiting.put(self.decoder.flush(t_ns))
-        scan = self._waiting.take()
-        n = self.detector.step(t_ns, scan)
-        answers: list[Frame] = []
-        if scan is not None:
-            self._waiting.done(scan)
-            self._seen_ns = t_ns
-            reports = self.detector.reports[:n]
-            for watcher in self._watchers:
-                watcher(t_ns, reports)
-            if self._smoother is None:
-                answers += self._say(t_ns, t_ns, reports)
+        self.prepare(t_ns, frames)
+        overdue = self.decoder.flush(t_ns)
+        if overdue is not None:
+            self._take(t_ns, overdue)
+        if self._reported is None:
+            self.detector.step(t_ns, None)
+        answers, n = self._answers, self._reported or 0
+        self._taken, self._reported, self._answers = 0, None, []
         if self._smoother is not None:
             for scan_t_ns, reports in self._smoother.due(t_ns):
                 answers += self._say(t_ns, scan_t_ns, reports)
@@ -184,17 +180,55 @@ class DetectorNode:
             answers.append(status._replace(channel=self._channel))
         return answers
 
-    def rehearse(self, t_ns: int, frames: list[Frame]) -> None:
+    def prepare(self, t_ns: int, frames: list[Frame]) -> None:
+        """Do all of the step at ``t_ns`` that its first frames allow.
+
+        Any number of times before `step`, which does the rest, with all of the step's frames and
+        the same result as if there had been no calls: the first scan to be complete is the step's,
+        whatever comes after it, and the reports hold for the step's time.
+        """
+        if self._reported is None and (waiting := self._waiting.take()) is not None:
+            self._judge(t_ns, waiting)
+            self._waiting.done(waiting)
+        for frame in frames[self._taken :]:
+            scan = self.decoder.feed(frame)
+            if scan is not None:
+                self._channel = frame.channel
+                self._take(t_ns, scan)
+        self._taken = len(frames)
+
+    def _take(self, t_ns: int, scan: Scan) -> None:
+        """Judge the step's first scan; others wait for the next steps."""
+        if self._reported is None:
+            self._judge(t_ns, scan)
+        else:
+            self._waiting.put(scan)
+
+    def _judge(self, t_ns: int, scan: Scan) -> None:
+        """Step the detector and prepare the answer."""
+        self._reported = n = self.detector.step(t_ns, scan)
+        self._seen_ns = t_ns
+        reports = self.detector.reports[:n]
+        for watcher in self._watchers:
+            watcher(t_ns, reports)
+        if self._smoother is None:
+            self._answers += self._say(t_ns, t_ns, reports)
+
+    def rehearse(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
         """Do a step on copies of everything and forget it: shortly before the real one that
-        fetches code and tables into the processor's caches.  The first call makes the copies."""
+        fetches code and tables into the processor's caches.  The first call makes the copies.
+
+        Returns:
+            Frames like those of the step, not to be sent.
+        """
         understudy = getattr(self.detector, "understudy", None)
         if understudy is None:
-            return  # a stand-in for a detector
+            return []  # a stand-in for a detector
         if self._understudy is None:
             self._understudy = DetectorNode(
                 deepcopy(self.decoder), understudy(), ManoeuvreEncoder(), Health()
             )
-        self._understudy.step(t_ns, frames[:REHEARSED])
+        return self._understudy.step(t_ns, frames[:REHEARSED])
 
     def _say(self, t_ns: int, scan_t_ns: int, reports: Reports) -> list[Frame]:
         """Return the frames of a scan, stamped ``t_ns`` [ns], and tell the listeners of it."""

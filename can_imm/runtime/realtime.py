@@ -12,29 +12,37 @@ from typing import Any
 PRIORITY = 50
 """Under SCHED_FIFO; above ordinary work, below the kernel's own threads."""
 
-SWITCH_INTERVAL_S = 1e-4
-"""So soon a thread that computes hands over to the loop [s]; Python's own value is 5 ms."""
-
 _MCL_CURRENT_AND_FUTURE = 3
 
 
 def ask_process() -> None:
-    """Lock memory, freeze the collector, shorten the switch interval; call it once, when
-    everything is allocated.  What is refused is left as it was."""
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    """Lock memory, freeze the collector, and ask for SCHED_FIFO for the calling thread and those
+    that it will start; call it once, when everything is allocated.  What is refused is left as it
+    was.
+
+    The threads beside the loop need it, too: one of them may hold the interpreter's lock when the
+    loop wants it, and must not be made to wait then.  The switch interval stays Python's own: were
+    it shorter, every thread that is woken by a frame would break into the step.
+    """
     gc.collect()
     gc.freeze()
     gc.disable()
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT_AND_FUTURE)
+    _ask_fifo(PRIORITY - 1)
 
 
 def ask_thread() -> None:
-    """Ask for SCHED_FIFO and the last of the allowed cores, for the calling thread."""
+    """Ask for the last of the allowed cores and precedence over the other threads, for the calling
+    thread."""
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    _ask_fifo(PRIORITY)
+
+
+def _ask_fifo(priority: int) -> None:
     with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
 
 
 def granted() -> dict[str, Any]:

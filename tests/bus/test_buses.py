@@ -36,6 +36,7 @@ def pair():
 
 def test_frames_over_a_virtual_bus(pair):
     sink, source = BusSink(pair[0]), BusSource(pair[1])
+    sink.rehearse(Frame(0, 0x302, b"\x03"))
     before = time.time_ns()
     sink.send(Frame(0, 0x301, b"\x01\x02"))
     frame = source.recv(1.0)

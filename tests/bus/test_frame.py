@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from copy import deepcopy
+
 import can
 from hypothesis import given
 from hypothesis import strategies as st
@@ -42,6 +44,17 @@ def test_times_are_whole_microseconds_and_stay(message):
     assert frame.t_ns % 1000 == 0
     assert abs(frame.t_ns - message.timestamp * 1e9) <= 1500
     assert from_message(to_message(frame)) == frame
+
+
+@given(messages())
+def test_a_copy_of_a_message_is_one_of_its_own(message):
+    original = to_message(from_message(message))
+    copy = deepcopy(original)
+    assert copy.equals(original, timestamp_delta=0.0)
+    assert copy.dlc == original.dlc
+    assert isinstance(copy.data, bytearray)
+    copy.data += b"more"
+    assert original.data == message.data
 
 
 def test_a_frame_is_small():

@@ -60,7 +60,7 @@ def profile():
     return load_profile("can_imm")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_node(profile):
     """Return a function that builds a fresh detector node around a HashDetector."""
 

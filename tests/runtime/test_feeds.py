@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from can_imm.bus.frame import Frame
 from can_imm.runtime.clock import JUMP_NS, FastClock
-from can_imm.runtime.feeds import REHEARSE_S, BusFeed, IdleFeed, LogFeed
+from can_imm.runtime.feeds import AWAKE_S, FRAME_S, REHEARSAL_S, BusFeed, IdleFeed, LogFeed
 from can_imm.runtime.health import Health
 
 STEP = 10_000_000
@@ -79,29 +79,52 @@ class TestBusFeed:
         feed.collect(UNIX + STEP)
         assert 0 <= bus.time_ns - (UNIX + STEP + 2_000_000) <= US
 
-    def test_a_step_with_frames_is_rehearsed_with_them_before_it_is_due(self):
+    def test_a_step_with_frames_is_rehearsed_and_prepared_before_it_is_due(self):
         stamp = UNIX + STEP - US
         feed, bus, _ = live(UNIX, (stamp, frame(stamp)))
         said = []
         feed.rehearse = lambda t_ns, frames: said.append((t_ns, times(frames), bus.time_ns))
         feed.start_ns(STEP)
         assert said.pop() == (0, [], UNIX), "the first time is before the start"
+        feed.prepare = feed.rehearse
         for k in (1, 2):
             assert len(feed.collect(UNIX + k * STEP)) == (k == 1)
-        (rehearsal,) = said
+        rehearsal, preparation = said
+        assert rehearsal == preparation
         due = UNIX + STEP + 2_000_000
+        ahead_ns = (AWAKE_S + REHEARSAL_S + FRAME_S) * 1e9
         assert rehearsal[:2] == (UNIX + STEP, [stamp])
-        assert due - REHEARSE_S * 1e9 - US <= rehearsal[2] < due
+        assert due - ahead_ns - US <= rehearsal[2] < due - ahead_ns + 2 * US
 
-    def test_a_step_that_is_late_is_not_rehearsed(self):
-        stamp = UNIX + STEP - US
-        feed, bus, _ = live(UNIX, (stamp, frame(stamp)))
+    def test_frames_that_come_after_a_preparation_are_prepared_when_they_come(self):
+        due = UNIX + STEP + 2_000_000
+        stamps = [UNIX + STEP - 3 * US, UNIX + STEP - 2 * US, UNIX + STEP + US, UNIX + STEP - US]
+        at = [due - 1_000_000, due - 300_000, due - 200_000, due - 2_000]
+        feed, bus, _ = live(UNIX, *zip(at, map(frame, stamps), strict=True))
+        said, prepared = [], []
         feed.start_ns(STEP)
-        said = []
         feed.rehearse = lambda t_ns, frames: said.append(t_ns)
-        bus.time_ns = UNIX + STEP + 1_900_000
-        assert len(feed.collect(UNIX + STEP)) == 1
-        assert said == []
+        feed.prepare = lambda t_ns, frames: prepared.append((bus.time_ns, frames))
+        mine = feed.collect(UNIX + STEP)
+        assert times(mine) == [stamps[0], stamps[1], stamps[3]]
+        assert said == [UNIX + STEP]
+        # each time they are the first frames of the step, in its order
+        assert [frames for _, frames in prepared] == [mine[:1], mine[:2], mine[:2], mine]
+        assert [t_ns for t_ns, _ in prepared][1:] == at[1:]
+        assert prepared[0][0] < at[1]
+
+    def test_a_step_that_is_nearly_due_is_only_prepared_and_a_late_one_neither(self):
+        stamp = UNIX + STEP - US
+        for to_go_us, prepares in ((100, 1), (-100, 0)):
+            feed, bus, _ = live(UNIX, (stamp, frame(stamp)))
+            feed.start_ns(STEP)
+            rehearsed, prepared = [], []
+            feed.rehearse = lambda t_ns, frames, said=rehearsed: said.append(t_ns)
+            feed.prepare = lambda t_ns, frames, said=prepared: said.append(t_ns)
+            bus.time_ns = UNIX + STEP + 2_000_000 - to_go_us * US
+            assert len(feed.collect(UNIX + STEP)) == 1
+            assert rehearsed == []
+            assert len(prepared) == prepares
 
     def test_a_frame_that_is_late_within_the_guard_time_is_not_late(self):
         stamp = UNIX + STEP - US

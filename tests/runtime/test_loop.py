@@ -53,6 +53,27 @@ def test_every_step_is_executed_once_with_its_own_time():
     assert (health.steps, health.frames, health.sent) == (6, 4, 3)
 
 
+def test_a_rehearsal_goes_up_to_the_outputs_and_no_further():
+    class Bus(Keep):
+        def __init__(self) -> None:
+            super().__init__()
+            self.rehearsed: list[Frame] = []
+
+        def rehearse(self, frame: Frame) -> None:
+            self.rehearsed.append(frame)
+
+    class Rehearsing(Answer):
+        rehearse = Answer.step
+
+    bus, log, health = Bus(), Keep(), Health()
+    feed = LogFeed([], FastClock(), health)
+    Loop(feed, Rehearsing(), health, [bus], [log])
+    feed.rehearse(20 * MS, frames_at(11, 12))
+    assert bus.rehearsed == [Frame(20 * MS, 0x310, b"\2")]
+    assert bus.frames == log.frames == []
+    assert health == Health(response=health.response)
+
+
 def test_recorder_gets_everything_outputs_only_the_answers():
     bus, log = Keep(), Keep()
     received = frames_at(1, 2)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 
 from can_imm.bus.decoder import ScanDecoder
 from can_imm.bus.encoder import STATUS_ID, ManoeuvreEncoder, RadarEncoder, StatusValues
@@ -166,3 +170,40 @@ def test_rehearsals_change_no_answer(profile):
         assert len(said) > 60
         answers.append(said)
     assert answers[0] == answers[1]
+
+
+@given(st.data())
+def test_what_is_prepared_changes_no_answer(make_node, data):
+    """Steps with none to many scans, cut off and whole, dealt out in any portions."""
+    frames = iter(sensor_frames(40))
+    nodes = make_node(), make_node()
+    for k in range(12):
+        t_ns = START_NS + k * STEP_NS
+        number = data.draw(st.integers(0, 25 if k == 3 else 7))
+        # what a frame's time is does not matter here, but in order they must be
+        mine = [
+            f._replace(t_ns=t_ns - STEP_NS + (n + 1) * 1000, channel=f"vcan{n % 2}")
+            for n, f in enumerate(islice(frames, number))
+            if data.draw(st.integers(0, 9))
+        ]
+        for end in sorted(data.draw(st.lists(st.integers(0, len(mine)), max_size=4))):
+            nodes[0].prepare(t_ns, mine[:end])
+        assert nodes[0].step(t_ns, mine) == nodes[1].step(t_ns, mine)
+    assert nodes[0].detector.scans == nodes[1].detector.scans
+    assert nodes[0].dropped_scans == nodes[1].dropped_scans
+    assert nodes[0].decoder.counts == nodes[1].decoder.counts
+
+
+def test_a_scan_is_judged_when_it_is_complete_and_answered_in_its_step(make_node):
+    told = []
+    node = make_node(listeners=[lambda t_ns, reports: told.append(t_ns)])
+    frames = sensor_frames(2)
+    node.prepare(START_NS, frames[:2])
+    assert told == node.detector.scans == []
+    node.prepare(START_NS, frames[:3])
+    assert told == [START_NS]
+    node.prepare(START_NS, frames)
+    assert len(node.detector.scans) == 1, "a step has one scan, the next waits"
+    assert sum(f.id == 0x310 for f in node.step(START_NS, frames)) == 2
+    assert sum(f.id == 0x310 for f in node.step(START_NS + STEP_NS, [])) == 2
+    assert [t_ns for t_ns, _ in node.detector.scans] == told == [START_NS, START_NS + STEP_NS]
