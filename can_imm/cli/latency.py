@@ -124,6 +124,8 @@ def _figures(subject: Subject, measured: Measured) -> dict[str, Any]:
 def _print(name: str, figures: dict[str, Any]) -> None:
     from rich.console import Console
 
+    from can_imm.runtime.realtime import in_words
+
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"[bold]{name}[/]: {figures['rounds']['answered']:,} scans answered, "
                   f"{figures['rounds']['lost']:,} lost")  # fmt: skip
@@ -141,7 +143,4 @@ def _print(name: str, figures: dict[str, Any]) -> None:
     deadline, memory = figures["deadline"], figures["memory_kib"]
     console.print(f"  {deadline['steps']:,} steps, {deadline['missed']:,} deadlines missed; memory "
                   f"{memory[0]:,} KiB at first, {memory[-1]:,} KiB at last")  # fmt: skip
-    granted = ", ".join(
-        f"{key.replace('_', ' ')} {value}" for key, value in figures["granted"].items()
-    )
-    console.print(f"  [dim]granted: {granted}[/]")
+    console.print(f"  [dim]granted: {in_words(figures['granted'])}[/]")

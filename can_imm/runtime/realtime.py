@@ -59,6 +59,11 @@ def granted() -> dict[str, Any]:
     }
 
 
+def in_words(granted: dict[str, Any]) -> str:
+    """What `granted` returned, in one line."""
+    return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in granted.items())
+
+
 def resident_kib() -> int:
     """Memory of this process [KiB], 0 where the system does not tell."""
     return _status("VmRSS")

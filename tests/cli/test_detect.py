@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -101,6 +103,20 @@ def test_lagged_answers_on_the_bus_are_those_of_a_replay(can_imm, tmp_path):
     assert [m.arbitration_id for m in neighbour.heard].count(0x310) < 8
     with LogSource(log) as source:
         assert [f.id for f in source][-3:] == [0x310, 0x311, 0x31F]
+
+
+def test_realtime_says_what_was_granted():
+    """In a process of its own, which keeps what it is granted."""
+    command = "-m can_imm detect -i virtual -c realtime-test --duration 0.5 --realtime"
+    done = subprocess.run(
+        [sys.executable, *command.split()], capture_output=True, text=True, timeout=300, check=True
+    )
+    granted = re.search(r"^can-imm: granted: scheduler (\w+), .*", done.stderr, re.MULTILINE)
+    assert granted
+    assert granted[1] in ("fifo", "other")
+    assert "collector on, frozen" in granted[0], "it works on, but what was there before is left"
+    assert "switch interval s 0.005" in granted[0]
+    assert "deadlines missed" in done.stdout
 
 
 def test_duration_ends_it(can_imm):
