@@ -338,9 +338,11 @@ def birth_(
         log_c = math.log(bank.mu0[j])
         for c in range(bank.n_bounds[j]):
             s = bank.bound_state[j, c]
+            if s >= 4:
+                continue  # an acceleration, which nobody measures
             # Of a speed that is not measured the prior says enough to tell what stands still.
             known = valid[s] or bank.bound_kind[j, c] == GROUND
-            if bank.bound_mass[j, c] and s < 4 and known:
+            if bank.bound_mass[j, c] and known:
                 # Turned axes: a speed along the line of sight is taken as one along the road.
                 v = z[s] if s % 2 == 1 and valid[s] else x[s]
                 base = reference(bank.bound_kind[j, c], bank.bound_lanes[j, c], work, v)
