@@ -29,6 +29,7 @@ class RoadFrame:
 
     Attributes:
         x, P: (31,), (31, 31) state and covariance of the filter.
+        speed, yaw_rate: of the ego at the last scan [m/s, rad/s], NaN where unknown.
     """
 
     def __init__(self, par: FloatArray) -> None:
@@ -39,7 +40,8 @@ class RoadFrame:
         self.x, self.P = road.new_road(par)
         self._t_ns = -1
         self._dt = 0.1
-        self._speed = math.nan
+        self.speed = math.nan
+        self.yaw_rate = math.nan
         self._h = np.zeros(road.N_ROAD + 1)
         self._warm_up()
 
@@ -75,12 +77,13 @@ class RoadFrame:
             self._dt = dt
             road.predict_road_(self.x, self.P, self._par, dt, speed, yaw_rate)
         self._t_ns = t_ns
-        self._speed = speed
+        self.speed = speed
+        self.yaw_rate = yaw_rate
 
     def localise_(self, scan: Scan, z: FloatArray, r: FloatArray) -> None:
         """Measurements z, r (N, 4) of the scan into the road's axes, in place."""
         r[: scan.n, 2] += np.square(scan.lasting[: scan.n])
-        road.localise_(self.x, self.P, self._par, scan.n, z, r, scan.valid, scan.angle, self._speed)
+        road.localise_(self.x, self.P, self._par, scan.n, z, r, scan.valid, scan.angle, self.speed)
 
     def watch_(
         self, bank: ModeBank, objects: Any, scan: Scan, slot: Any, status: Any, age: Any
@@ -102,10 +105,10 @@ class RoadFrame:
 
         Without the ego's motion nothing is known of the road, and it is taken to be straight.
         """
-        if math.isnan(self._speed):
+        if math.isnan(self.speed):
             return
         doubt_(self.P, self._par[road.P_DOUBTFUL], self._h, reports, n)
 
     def globalise_(self, reports: np.ndarray[Any, np.dtype[np.void]], n: int) -> None:
         """The first n reports from the road's axes into the sensor's, in place."""
-        globalise_(self.x, self._h, reports, n, self._speed)
+        globalise_(self.x, self._h, reports, n, self.speed)
