@@ -236,7 +236,7 @@ class FixedIntervalSmoother(_Smoother):
     def __init__(self, bank: ModeBank) -> None:
         super().__init__(bank)
         if bank.road is not None:
-            self._hindsight = Hindsight(bank.record, bank.road)
+            self._hindsight = Hindsight(bank.record)
         self._now = 0
         self._look_ahead = int(LOOK_AHEAD_S * 1e9) // bank.step_ns
         self._ended: deque[tuple[int, _Track]] = deque()
@@ -262,10 +262,10 @@ class FixedIntervalSmoother(_Smoother):
                 self._release(track, track.rows.measured_before(last))
         while self._ended and self._ended[0][0] <= now:
             self._release_ended()
-        if self._hindsight is not None and self._pending:
-            self._hindsight.forget(
-                min(int(track.rows.scan[0]) for track in self._pending[0].tracks)
-            )
+        if self._hindsight is not None:
+            tracks = [*self._tracks.values(), *(track for _, track in self._ended)]
+            if tracks:
+                self._hindsight.forget(min(int(track.rows.scan[0]) for track in tracks))
 
     def end(self, slot: int) -> None:
         """Smooth the track that ended in this slot, as soon as the road there is known."""
@@ -293,6 +293,8 @@ class FixedIntervalSmoother(_Smoother):
         """End all tracks and give out all that is left, as `due` does."""
         for slot in list(self._tracks):
             self.end(slot)
+        if self._hindsight is not None:
+            self._hindsight.look_ahead(track.rows for _, track in self._ended)
         while self._ended:
             self._release_ended()
         return self.due()

@@ -19,14 +19,14 @@ import numpy as np
 
 from can_imm.types import FloatArray
 
-RATE = 0.05
+RATE = 0.03
 """Lane changes of a vehicle [1/s]."""
 SHORTEST, LONGEST = 2.5, 7.5
 N_DURATIONS = 11
 """Durations of lane changes that are tried [s]."""
-USUAL, SPREAD = 4.4, 0.28
+USUAL, SPREAD = 4.3, 0.24
 """Median of the durations [s], and standard deviation of their logarithm."""
-HURRY = 0.6
+HURRY = 0.5
 """How fast the place beside the course is forgotten [1/s]: rate of the Matern process."""
 IMPOSSIBLE = 18.0
 """A course whose log weight is so much lower than that of the best one is given up."""

@@ -26,7 +26,7 @@ RAMP, RAMP_STD = 1.4, 0.8
 """Acceleration in a ramp [m/s²], its sign aside."""
 WEAKEST = 0.2
 """Ramps are about so strong at least [m/s²]."""
-RESTLESS, RESTLESS_RAMP, JERK = 0.001, 0.003, 0.05
+RESTLESS, RESTLESS_RAMP, JERK = 0.0005, 0.001, 0.01
 """Densities of the noise of the speed, also in ramps [m²/s³], and of a ramp's acceleration [m²/s⁵]."""
 OUTLIER = 16.0
 """Squared normalised error of a measurement counts as this at most."""
