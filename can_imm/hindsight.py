@@ -122,6 +122,8 @@ class Hindsight:
         ego = self._ego.journey(begin, int(scan[-1]), LOOK_AHEAD_S)
         scan -= begin
         z, r = rows.z[measured], rows.r[measured]
+        if not (r[:, Y] < np.inf).any():
+            return
         ego_speed, ego_rate = self._ego_speeds(ego)
         way = self._road(begin, ego, ego_speed.mean(axis=1))
         place, beside = way.place(scan, z, r)
@@ -135,7 +137,7 @@ class Hindsight:
         )
         judge_speeds_(along - ego_speed[scan], rate - ego_rate[scan], p[:, 2:])
         # across it
-        lane = width * round(float(np.nanmedian(place[:, Y])) / width)
+        lane = width * round(float(np.nanmedian(seen[:, Y])) / width)
         find_lane_changes_(
             t, place[:, Y] - lane, r[:, Y].copy(), place[:, VY].copy(), r[:, VY].copy(), beside,
             width, p[:, :2],

@@ -376,6 +376,6 @@ class FixedLagSmoother(_Smoother):
                 rows.drop(done)
                 track.base += done
         n = len(scan.tracks)
-        if scan.ego_speed == scan.ego_speed:
+        if self._doubtful > 0.0 and scan.ego_speed == scan.ego_speed:
             doubt_(scan.road_cov, self._doubtful, self._h, self._out, n)
         return self._relate(scan, self._out[:n])

@@ -32,8 +32,39 @@ IMPOSSIBLE = 18.0
 """A course whose log weight is so much lower than that of the best one is given up."""
 OUTLIER = 16.0
 """Squared normalised error of a measurement counts as this at most."""
+SETTLE = 1.0
+"""So long after its end [s] a course is still followed on its own: whether it ended too early shows
+only then."""
 EDGE = 12
 """Lanes are numbered from -EDGE to EDGE."""
+N_LANES = 2 * EDGE + 1
+N_BEGUN = 8
+"""Courses that had begun before the first measurement are tried from so many beginnings."""
+UNKNOWN = 1e6
+"""A measurement with a larger variance is none."""
+
+COURSE_DTYPE = np.dtype(
+    [
+        ("first", np.int64),
+        ("end", np.int64),
+        ("merged", np.int64),
+        ("start", np.float64),
+        ("duration", np.float64),
+        ("lane", np.int64),
+        ("turn", np.int64),
+        ("log_prior", np.float64),
+        ("log_before", np.float64),
+        ("log_like", np.float64),
+        ("place", np.float64),
+        ("rate", np.float64),
+    ],
+    align=True,
+)
+"""A lane change that may have been: rows ``first`` to ``end`` - 1 lie in it, from ``merged`` on it
+is one with its new lane; it began at ``start`` and lasted ``duration`` [s], from ``lane`` (0 to `N_LANES` - 1) to that + ``turn``.  Logarithms of
+its prior probability where it begins, of the weight of what led there, and of the likelihood of
+what was measured during it (backwards: from its beginning to the track's end).  ``place``, ``rate``
+beside the course [m, m/s]."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -58,6 +89,37 @@ def add_logs(a: float, b: float) -> float:  # pragma: no cover - compiled
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def grown(courses: Any) -> Any:  # pragma: no cover - compiled
+    """The same courses with twice the room."""
+    more = np.zeros(2 * len(courses), COURSE_DTYPE)
+    for c in range(len(courses)):
+        more[c] = courses[c]
+    return more
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def usual_durations() -> tuple[FloatArray, FloatArray]:  # pragma: no cover - compiled
+    """Durations (N,) of lane changes [s] and logarithms (N,) of their prior probabilities."""
+    duration, log_p = np.empty(N_DURATIONS), np.empty(N_DURATIONS)
+    for i in range(N_DURATIONS):
+        duration[i] = SHORTEST * (LONGEST / SHORTEST) ** (i / (N_DURATIONS - 1))
+        log_p[i] = -0.5 * (math.log(duration[i] / USUAL) / SPREAD) ** 2
+    return duration, log_p - math.log(np.sum(np.exp(log_p)))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def begin_(
+    course: Any, first: int, end: int, start: float, duration: float, lane: int, turn: int
+) -> None:  # pragma: no cover - compiled
+    """Where and when a course runs; the rest is 0."""
+    course.first, course.end, course.merged = first, end, end
+    course.start, course.duration = start, duration
+    course.lane, course.turn = lane, turn
+    course.log_prior = course.log_before = course.log_like = 0.0
+    course.place = course.rate = 0.0
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def find_lane_changes_(
     t: FloatArray,
     y: FloatArray,
@@ -68,231 +130,200 @@ def find_lane_changes_(
     width: float,
     p: FloatArray,
 ) -> None:  # pragma: no cover - compiled
+    """Probability that a vehicle was changing lanes, by all that was measured of it.
+
+    Args:
+        t: (K,) ascending [s].
+        y, vy: (K,) place and speed across the road [m, m/s]; the middles of lanes lie at multiples
+            of the width.  r, rv: (K,) variances, infinite where not measured.
+        beside: (K,) standard deviation of the place beside the course [m].
+        width: of the lanes [m].
+        p: (K, 2) written: changing to the left, to the right.
+    """
     n = len(t)
-    lanes = 2 * EDGE + 1
-    alpha = np.full((n, lanes), -np.inf)
-    beta = np.full((n, lanes), -np.inf)
-    ll = np.zeros((n, lanes))
-    m = np.zeros((lanes, 2))
-    pred = np.zeros((lanes, 2))
-    duration = np.empty(N_DURATIONS)
-    log_prior = np.empty(N_DURATIONS)
-    total = 0.0
-    for i in range(N_DURATIONS):
-        duration[i] = SHORTEST * (LONGEST / SHORTEST) ** (i / (N_DURATIONS - 1))
-        d = math.log(duration[i] / USUAL) / SPREAD
-        log_prior[i] = -0.5 * d * d
-        total += math.exp(log_prior[i])
-    for i in range(N_DURATIONS):
-        log_prior[i] -= math.log(total)
-    cap = 4096
-    first = np.empty(cap, np.int32)   # transition first-1 -> first; 0: before the track
-    end = np.empty(cap, np.int32)
-    start = np.empty(cap)
-    dur = np.empty(cap, np.int8)
-    lane = np.empty(cap, np.int8)
-    turn = np.empty(cap, np.int8)
-    weight = np.empty(cap)
-    like = np.empty(cap)
-    mean = np.empty((cap, 2))
-    count = 0
-    active = np.empty(cap, np.int32)
-    n_active = 0
-    # before the first
-    P00 = beside[0] ** 2
-    P01 = 0.0
-    P11 = (HURRY * beside[0]) ** 2
-    for l in range(lanes):
-        alpha[0, l] = 0.0
-    best = -np.inf
+    # logarithms: weight of being in a lane by what was measured until then, likelihood of the
+    # measurement there, likelihood of all that was measured afterwards
+    alpha = np.zeros((n, N_LANES))
+    like = np.zeros((n, N_LANES))
+    beta = np.zeros((n, N_LANES))
+    place, rate = np.zeros(N_LANES), np.zeros(N_LANES)
+    duration, log_p = usual_durations()
+    courses = np.zeros(4096, COURSE_DTYPE)
+    active = np.zeros(4096, np.int64)
+    count = n_active = 0
+    P00, P01, P11 = beside[0] ** 2, 0.0, (HURRY * beside[0]) ** 2
+    f00, f01, f10, f11 = 1.0, 0.0, 0.0, 1.0
+    best = 0.0
     for k in range(n):
-        # predict the covariance
-        if k > 0:
-            dt = t[k] - t[k - 1]
-            a = HURRY
-            ex = math.exp(-a * dt)
-            f00, f01, f10, f11 = (1.0 + a * dt) * ex, dt * ex, -a * a * dt * ex, (1.0 - a * dt) * ex
-            s0 = beside[k] ** 2
-            s1 = a * a * s0
-            # P = F (P - Pinf) F' + Pinf
-            d00, d01, d11 = P00 - s0, P01, P11 - s1
-            g00, g01 = f00 * d00 + f01 * d01, f00 * d01 + f01 * d11
-            g10, g11 = f10 * d00 + f11 * d01, f10 * d01 + f11 * d11
-            P00 = g00 * f00 + g01 * f01 + s0
-            P01 = g00 * f10 + g01 * f11
-            P11 = g10 * f10 + g11 * f11 + s1
-            for l in range(lanes):
-                alpha[k, l] = alpha[k - 1, l] + math.log1p(-min(RATE * dt, 0.5))
-                pred[l, 0] = f00 * m[l, 0] + f01 * m[l, 1]
-                pred[l, 1] = f10 * m[l, 0] + f11 * m[l, 1]
-        else:
-            dt = 0.0
-            f00 = f01 = f10 = f11 = 0.0
-        # new changes
-        if k > 0:
-            for l in range(1, lanes - 1):
-                if alpha[k - 1, l] < best - IMPOSSIBLE:
+        # what may begin
+        dt = t[k] - t[max(k - 1, 0)]
+        for lane in range(1, N_LANES - 1):
+            if k > 0 and alpha[k - 1, lane] < best - IMPOSSIBLE:
+                continue
+            for turn in (-1, 1):
+                # at first only what passes the place where the vehicle is
+                off = y[k] / width - (lane - EDGE + 0.5 * turn)
+                if k == 0 and abs(off) > 1.0:
                     continue
-                for d in (-1, 1):
-                    for i in range(N_DURATIONS):
-                        if count == cap:
-                            cap *= 2
-                            first = np.concatenate((first, np.empty_like(first)))
-                            end = np.concatenate((end, np.empty_like(end)))
-                            start = np.concatenate((start, np.empty_like(start)))
-                            dur = np.concatenate((dur, np.empty_like(dur)))
-                            lane = np.concatenate((lane, np.empty_like(lane)))
-                            turn = np.concatenate((turn, np.empty_like(turn)))
-                            weight = np.concatenate((weight, np.empty_like(weight)))
-                            like = np.concatenate((like, np.empty_like(like)))
-                            mean = np.concatenate((mean, np.empty_like(mean)))
-                            active = np.concatenate((active, np.empty_like(active)))
-                        c = count
-                        first[c], end[c], start[c] = k, n, t[k] - 0.5 * dt
-                        dur[c], lane[c], turn[c] = i, l, d
-                        weight[c] = alpha[k - 1, l] + math.log(0.5 * RATE * dt) + log_prior[i]
-                        like[c] = 0.0
-                        mean[c, 0], mean[c, 1] = m[l, 0], m[l, 1]
-                        active[n_active] = c
+                for i in range(N_DURATIONS):
+                    for b in range(1 if k > 0 else N_BEGUN):
+                        if count == len(courses):
+                            courses = grown(courses)
+                            active = np.concatenate((active, np.zeros_like(active)))
+                        start = t[k] - 0.5 * dt
+                        span = dt
+                        if k == 0:
+                            start = t[0] - (b + 0.5) / N_BEGUN * duration[i]
+                            span = duration[i] / N_BEGUN
+                        c = courses[count]
+                        begin_(c, k, n, start, duration[i], lane, turn)
+                        c.log_prior = math.log(0.5 * RATE * span) + log_p[i]
+                        if k > 0:
+                            c.log_before = alpha[k - 1, lane]
+                            c.place, c.rate = place[lane], rate[lane]
+                        active[n_active] = count
                         n_active += 1
                         count += 1
-        else:
-            for l in range(1, lanes - 1):
-                for d in (-1, 1):
-                    q0 = abs(y[0] / width - (l - EDGE + 0.5 * d))
-                    if q0 > 1.0:
-                        continue
-                    for i in range(N_DURATIONS):
-                        steps = 8
-                        for s in range(steps):
-                            c = count
-                            first[c], end[c] = 0, n
-                            start[c] = t[0] - (s + 0.5) / steps * duration[i]
-                            dur[c], lane[c], turn[c] = i, l, d
-                            weight[c] = math.log(0.5 * RATE * duration[i] / steps) + log_prior[i]
-                            like[c] = 0.0
-                            mean[c] = 0.0
-                            active[n_active] = c
-                            n_active += 1
-                            count += 1
-        # move, end
+        # on to this row
+        if k > 0:
+            fade = math.exp(-HURRY * dt)
+            f00, f01 = (1.0 + HURRY * dt) * fade, dt * fade
+            f10, f11 = -HURRY * HURRY * dt * fade, (1.0 - HURRY * dt) * fade
+            # F (P - S) F' + S, S the stationary covariance
+            s00, s11 = beside[k] ** 2, (HURRY * beside[k]) ** 2
+            d00, d11 = P00 - s00, P11 - s11
+            g00, g01 = f00 * d00 + f01 * P01, f00 * P01 + f01 * d11
+            g10, g11 = f10 * d00 + f11 * P01, f10 * P01 + f11 * d11
+            P00, P01, P11 = g00 * f00 + g01 * f01 + s00, g00 * f10 + g01 * f11, g10 * f10 + g11 * f11
+            P11 += s11
+            for lane in range(N_LANES):
+                alpha[k, lane] = alpha[k - 1, lane] + math.log1p(-min(RATE * dt, 0.5))
+                a, b = place[lane], rate[lane]
+                place[lane], rate[lane] = f00 * a + f01 * b, f10 * a + f11 * b
         kept = 0
-        for b in range(n_active):
-            c = active[b]
-            if k > 0:
-                v0, v1 = mean[c, 0], mean[c, 1]
-                mean[c, 0] = f00 * v0 + f01 * v1
-                mean[c, 1] = f10 * v0 + f11 * v1
-            if t[k] >= start[c] + duration[dur[c]]:
-                end[c] = k
-                to = lane[c] + turn[c]
-                w = weight[c] + like[c]
-                tot = add_logs(alpha[k, to], w)
-                q = math.exp(w - tot)
-                pred[to, 0] += q * (mean[c, 0] - pred[to, 0])
-                pred[to, 1] += q * (mean[c, 1] - pred[to, 1])
-                alpha[k, to] = tot
+        for q in range(n_active):
+            c = courses[active[q]]
+            a, b = c.place, c.rate
+            c.place, c.rate = f00 * a + f01 * b, f10 * a + f11 * b
+            since = t[k] - c.start - c.duration
+            if since >= 0.0 and c.end == n:
+                c.end = k
+            if since < SETTLE:
+                active[kept] = active[q]
+                kept += 1
                 continue
-            active[kept] = c
-            kept += 1
+            c.merged = k
+            to = c.lane + c.turn
+            log_w = c.log_before + c.log_prior + c.log_like
+            total = add_logs(alpha[k, to], log_w)
+            w = math.exp(log_w - total)
+            place[to] += w * (c.place - place[to])
+            rate[to] += w * (c.rate - rate[to])
+            alpha[k, to] = total
         n_active = kept
-        # gains
-        use_y = r[k] < 1e6
-        use_v = rv[k] < 1e6
-        Sy = P00 + r[k]
-        k0, k1 = P00 / Sy, P01 / Sy
-        if not use_y:
-            k0 = k1 = 0.0
-        A00, A01, A11 = P00 - k0 * P00, P01 - k0 * P01, P11 - k1 * P01
-        Sv = A11 + rv[k]
-        h0, h1 = A01 / Sv, A11 / Sv
-        if not use_v:
-            h0 = h1 = 0.0
-        P00, P01, P11 = A00 - h0 * A01, A01 - h0 * A11, A11 - h1 * A11
-        cy = -0.5 * math.log(Sy) if use_y else 0.0
-        cv = -0.5 * math.log(Sv) if use_v else 0.0
+        # the measurement
+        var_y, k0, k1 = 1.0, 0.0, 0.0
+        if r[k] < UNKNOWN:
+            var_y = P00 + r[k]
+            k0, k1 = P00 / var_y, P01 / var_y
+        P00, P01, P11 = P00 - k0 * P00, P01 - k0 * P01, P11 - k1 * P01
+        var_v, h0, h1 = 1.0, 0.0, 0.0
+        if rv[k] < UNKNOWN:
+            var_v = P11 + rv[k]
+            h0, h1 = P01 / var_v, P11 / var_v
+        P00, P01, P11 = P00 - h0 * P01, P01 - h0 * P11, P11 - h1 * P11
+        scale = -0.5 * (math.log(var_y) + math.log(var_v))
         best = -np.inf
-        for l in range(lanes):
-            e = y[k] - (l - EDGE) * width - pred[l, 0]
-            v = 0.0
-            a0, a1 = pred[l, 0], pred[l, 1]
-            if use_y:
-                v += cy - 0.5 * min(e * e / Sy, OUTLIER)
-                a0 += k0 * e
-                a1 += k1 * e
-            if use_v:
-                e = vy[k] - a1
-                v += cv - 0.5 * min(e * e / Sv, OUTLIER)
-                a0 += h0 * e
-                a1 += h1 * e
-            m[l, 0], m[l, 1] = a0, a1
-            ll[k, l] = v
-            alpha[k, l] += v
-            best = max(best, alpha[k, l])
-        for b in range(n_active):
-            c = active[b]
-            T = duration[dur[c]]
-            done, slope = course((t[k] - start[c]) / T)
-            e = y[k] - (lane[c] - EDGE + turn[c] * done) * width - mean[c, 0]
-            v = 0.0
-            if use_y:
-                v += cy - 0.5 * min(e * e / Sy, OUTLIER)
-                mean[c, 0] += k0 * e
-                mean[c, 1] += k1 * e
-            if use_v:
-                e = vy[k] - turn[c] * slope * width / T - mean[c, 1]
-                v += cv - 0.5 * min(e * e / Sv, OUTLIER)
-                mean[c, 0] += h0 * e
-                mean[c, 1] += h1 * e
-            like[c] += v
-            best = max(best, weight[c] + like[c])
+        for lane in range(N_LANES):
+            log_l = scale
+            if r[k] < UNKNOWN:
+                e = y[k] - (lane - EDGE) * width - place[lane]
+                log_l -= 0.5 * min(e * e / var_y, OUTLIER)
+                place[lane] += k0 * e
+                rate[lane] += k1 * e
+            if rv[k] < UNKNOWN:
+                e = vy[k] - rate[lane]
+                log_l -= 0.5 * min(e * e / var_v, OUTLIER)
+                place[lane] += h0 * e
+                rate[lane] += h1 * e
+            like[k, lane] = log_l
+            alpha[k, lane] += log_l
+            best = max(best, alpha[k, lane])
+        for q in range(n_active):
+            c = courses[active[q]]
+            done, slope = course(min((t[k] - c.start) / c.duration, 1.0))
+            log_l = scale
+            if r[k] < UNKNOWN:
+                e = y[k] - (c.lane - EDGE + c.turn * done) * width - c.place
+                log_l -= 0.5 * min(e * e / var_y, OUTLIER)
+                c.place += k0 * e
+                c.rate += k1 * e
+            if rv[k] < UNKNOWN:
+                e = vy[k] - c.turn * slope * width / c.duration - c.rate
+                log_l -= 0.5 * min(e * e / var_v, OUTLIER)
+                c.place += h0 * e
+                c.rate += h1 * e
+            c.log_like += log_l
+            best = max(best, c.log_before + c.log_prior + c.log_like)
         kept = 0
-        for b in range(n_active):
-            c = active[b]
-            if weight[c] + like[c] < best - IMPOSSIBLE:
-                like[c] = -np.inf
-                continue
-            active[kept] = c
-            kept += 1
+        for q in range(n_active):
+            c = courses[active[q]]
+            if c.log_before + c.log_prior + c.log_like < best - IMPOSSIBLE:
+                c.log_like = -np.inf
+            else:
+                active[kept] = active[q]
+                kept += 1
         n_active = kept
-    # back
-    for l in range(lanes):
-        beta[n - 1, l] = 0.0
+    look_back_(t, alpha, like, beta, courses, count, p)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def look_back_(
+    t: FloatArray,
+    alpha: FloatArray,
+    like: FloatArray,
+    beta: FloatArray,
+    courses: Any,
+    count: int,
+    p: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """The backward half of `find_lane_changes_`; see there."""
+    n = len(t)
+    total = -np.inf
     c = count - 1
-    for b in range(n):
-        k = n - 1 - b
+    for q in range(n):
+        # courses are in the order of their first rows
+        k = n - 1 - q
         if k < n - 1:
-            dt = t[k + 1] - t[k]
-            for l in range(lanes):
-                beta[k, l] = math.log1p(-min(RATE * dt, 0.5)) + ll[k + 1, l] + beta[k + 1, l]
-            while c >= 0 and first[c] == k + 1:
-                l = lane[c]
-                after = 0.0
-                if end[c] < n:
-                    to = l + turn[c]
-                    after = ll[end[c], to] + beta[end[c], to]
-                like[c] += after
-                if like[c] > -np.inf:
-                    beta[k, l] = add_logs(
-                        beta[k, l], math.log(0.5 * RATE * dt) + log_prior[dur[c]] + like[c]
-                    )
-                c -= 1
-    z = -np.inf
-    for l in range(lanes):
-        z = add_logs(z, alpha[0, l] + beta[0, l])
+            stay = math.log1p(-min(RATE * (t[k + 1] - t[k]), 0.5))
+            for lane in range(N_LANES):
+                beta[k, lane] = stay + like[k + 1, lane] + beta[k + 1, lane]
+        while c >= 0 and courses[c].first > k:
+            lane = courses[c].lane
+            add_rest_(courses[c], n, like, beta)
+            beta[k, lane] = add_logs(beta[k, lane], courses[c].log_prior + courses[c].log_like)
+            c -= 1
+    for lane in range(N_LANES):
+        total = add_logs(total, alpha[0, lane] + beta[0, lane])
     while c >= 0:
-        if end[c] < n:
-            to = lane[c] + turn[c]
-            like[c] += ll[end[c], to] + beta[end[c], to]
-        if like[c] > -np.inf:
-            z = add_logs(z, weight[c] + like[c])
+        add_rest_(courses[c], n, like, beta)
+        total = add_logs(total, courses[c].log_prior + courses[c].log_like)
         c -= 1
-    for k in range(n):
-        p[k, 0] = p[k, 1] = 0.0
+    p[:] = 0.0
     for c in range(count):
-        q = weight[c] + like[c] - z
-        if q > -20.0:
-            q = math.exp(q)
-            side = 0 if turn[c] > 0 else 1
-            for k in range(first[c], min(end[c], n)):
-                p[k, side] += q
+        one = courses[c]
+        log_w = one.log_before + one.log_prior + one.log_like - total
+        if log_w > -IMPOSSIBLE:
+            side = 0 if one.turn > 0 else 1
+            for k in range(one.first, one.end):
+                p[k, side] += math.exp(log_w)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def add_rest_(
+    course: Any, n: int, like: FloatArray, beta: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """Add what was measured after a course became one with its lane."""
+    if course.merged < n:
+        to = course.lane + course.turn
+        course.log_like += like[course.merged, to] + beta[course.merged, to]

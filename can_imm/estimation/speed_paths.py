@@ -20,13 +20,13 @@ from can_imm.types import FloatArray
 
 N_MODES = 3
 """Hold, speed up, slow down."""
-BEGIN, END, TURN = 0.2, 0.35, 0.1
+BEGIN, END, TURN = 0.15, 0.45, 0.1
 """Rates at which ramps begin, end, and turn into the opposite [1/s]."""
 RAMP, RAMP_STD = 1.4, 0.8
 """Acceleration in a ramp [m/s²], its sign aside."""
 WEAKEST = 0.2
 """Ramps are about so strong at least [m/s²]."""
-RESTLESS, RESTLESS_RAMP, JERK = 0.0005, 0.001, 0.01
+RESTLESS, RESTLESS_RAMP, JERK = 0.0002, 0.0004, 0.003
 """Densities of the noise of the speed, also in ramps [m²/s³], and of a ramp's acceleration [m²/s⁵]."""
 OUTLIER = 16.0
 """Squared normalised error of a measurement counts as this at most."""
