@@ -19,8 +19,9 @@ from can_imm.estimation import road
 from can_imm.estimation.ego_path import reckon_, straighten_rows_
 from can_imm.estimation.road import BIAS, MOUNTING, N_ROAD, OFFSET
 from can_imm.road import LONGEST_S, RoadFrame
-from can_imm.types import VX, VY, FloatArray, IntArray, X, Y
+from can_imm.types import VX, VY, FloatArray, X, Y
 
+Int64Array = npt.NDArray[np.int64]
 Ego = npt.NDArray[Any]
 """Structured array of `EGO_DTYPE`, one record per scan."""
 
@@ -44,7 +45,7 @@ MOST_BIAS = 0.004
 """Largest error of the ego's yaw rate that is believed [rad/s]."""
 BESIDE = 0.35
 """Standard deviation of vehicles' places beside the middle of their lanes [m]."""
-DRIFT = 0.0017
+DRIFT = 0.0035
 """And that of what is thought of the lanes' place, per metre ahead of the ego [m/m]."""
 LEAST_STEP = 1.0
 """Points of the road's line are so far apart [m]."""
@@ -78,7 +79,7 @@ class RoadAtTheTime:
         self._way: FloatArray = np.concatenate(([0.0], way))
         self._h: FloatArray = np.zeros(N_ROAD + 1)
 
-    def lane(self, scan: IntArray, x: FloatArray) -> FloatArray:
+    def lane(self, scan: Int64Array, x: FloatArray) -> FloatArray:
         """Where in scan k, at distance x [m], the ego's lane was taken to be [m]; (K,) each."""
         out = np.zeros(len(x))
         for k, i in enumerate(scan):
@@ -87,7 +88,7 @@ class RoadAtTheTime:
         return out
 
     def place(
-        self, scan: IntArray, z: FloatArray, r: FloatArray
+        self, scan: Int64Array, z: FloatArray, r: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """See the module's text.
 
@@ -132,7 +133,7 @@ class RoadDriven:
         way = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T))))
         kept = np.searchsorted(way, np.arange(0.0, way[-1], LEAST_STEP))
         line = line[np.unique(np.append(kept, len(way) - 1))]
-        last = np.full(len(AHEAD), len(ego) - 1, np.int32)
+        last = np.full(len(AHEAD), len(ego) - 1)
         across = RoadAtTheTime(ego, speed).lane(last, AHEAD) - ego["shift"][-1]
         across += self._mounting * AHEAD + ahead_rows(AHEAD) @ correction
         cos, sin = math.cos(pose[-1, 2]), math.sin(pose[-1, 2])
@@ -141,7 +142,7 @@ class RoadDriven:
         steps = np.hypot(*np.diff(self._line, axis=0).T)
         self._station: FloatArray = np.concatenate(([0.0], np.cumsum(steps)))
 
-    def straighten(self, scan: IntArray, z: FloatArray, r: FloatArray) -> FloatArray:
+    def straighten(self, scan: Int64Array, z: FloatArray, r: FloatArray) -> FloatArray:
         """What `place` gives first."""
         out = np.zeros_like(z)
         straighten_rows_(
@@ -151,10 +152,10 @@ class RoadDriven:
 
     def beyond(self, way: FloatArray) -> FloatArray:
         """How far ways (K,) along the road lie beyond the ego's last place [m], 0 for the rest."""
-        return np.maximum(way - self._station[-len(AHEAD) - 1], 0.0)
+        return np.asarray(np.maximum(way - self._station[-len(AHEAD) - 1], 0.0))
 
     def place(
-        self, scan: IntArray, z: FloatArray, r: FloatArray
+        self, scan: Int64Array, z: FloatArray, r: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """See the module's text.
 
@@ -164,7 +165,8 @@ class RoadDriven:
         out = self.straighten(scan, z, r)
         rows = ahead_rows(self.beyond(out[:, X]))
         error = np.einsum("ki,ij,kj->k", rows, self._cov, rows)
-        return out, np.sqrt(BESIDE**2 + (DRIFT * z[:, X]) ** 2 + error)
+        beside: FloatArray = np.sqrt(BESIDE**2 + (DRIFT * z[:, X]) ** 2 + error)
+        return out, beside
 
 
 def learn_ahead(
@@ -194,7 +196,7 @@ def learn_ahead(
     for _ in range(10):
         weight = 1.0 / (1.0 + np.square((y - design @ x) / AHEAD_STD))
         weighted = design.T * weight / AHEAD_STD**2
-        cov = np.linalg.inv(weighted @ design + prior)
+        cov: FloatArray = np.asarray(np.linalg.inv(weighted @ design + prior), np.float64)
         x = cov @ weighted @ y
     return x[:3], cov[:3, :3]
 

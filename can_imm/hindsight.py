@@ -51,6 +51,7 @@ _KEEP_LANE = int(Manoeuvre.KEEP_LANE)
 _STATIONARY = int(Manoeuvre.STATIONARY)
 _ONCOMING = int(Manoeuvre.ONCOMING)
 
+
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def label_(
     bank: Any, width: float, p: FloatArray, lateral: FloatArray, reports: Any

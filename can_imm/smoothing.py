@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from can_imm.estimation.entry import entry_point
-from can_imm.estimation.road import N_ROAD, P_DOUBTFUL, WIDTH
+from can_imm.estimation.road import N_ROAD, P_DOUBTFUL
 from can_imm.estimation.smoother import smooth_
 from can_imm.estimation.smoother_pairs import SMOOTHER_DTYPE
 from can_imm.hindsight import LOOK_AHEAD_S, Hindsight

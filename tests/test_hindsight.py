@@ -50,8 +50,9 @@ class Drive:
         """x, vx, y, vy of a vehicle in scan k, as fast as the ego."""
         at = np.array([self.s[k], self.s[k] + ahead])
         _, heading, x, y = self.road.at(at)
-        x, y = x - np.array([self.d[k], d]) * np.sin(heading), y + np.array([self.d[k], d]) * np.cos(
-            heading
+        x, y = (
+            x - np.array([self.d[k], d]) * np.sin(heading),
+            y + np.array([self.d[k], d]) * np.cos(heading),
         )
         cos, sin = math.cos(self.heading[k]), math.sin(self.heading[k])
         dx, dy = x[1] - x[0], y[1] - y[0]
@@ -87,7 +88,9 @@ def test_beyond_the_last_place_nobody_knows() -> None:
     ego = drive.history.journey(0, len(drive.t) - 1, 0.0)
     last = len(drive.t) - 1
     scan = np.array([0, last, last])
-    z = np.array([drive.seen(int(k), x, 0.0) for k, x in zip(scan, (60.0, 60.0, 120.0), strict=True)])
+    z = np.array(
+        [drive.seen(int(k), x, 0.0) for k, x in zip(scan, (60.0, 60.0, 120.0), strict=True)]
+    )
     cov = np.diag(np.square([0.002, 1e-4, 1e-6]))
     speed = np.full(len(drive.t), SPEED)
     _, beside = RoadDriven(ego, speed, np.zeros(3), cov).place(scan, z, np.ones_like(z))

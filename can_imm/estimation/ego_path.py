@@ -1,12 +1,13 @@
 """Where the road went, by hindsight: the ego has driven there meanwhile.
 
-The ego's path by its speed and yaw rate, and its place in its lane, make the middle of a lane a line
-on the ground; an object's place on the road is its distance from that line.
+The ego's path by its speed and yaw rate, and its place in its lane, make the middle of a lane a
+line on the ground; an object's place on the road is its distance from that line.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
@@ -73,7 +74,7 @@ def project(
 def straighten_rows_(
     z: FloatArray,
     r: FloatArray,
-    scan: FloatArray,
+    scan: Any,
     pose: FloatArray,
     speed: FloatArray,
     mounting: float,

@@ -1,12 +1,12 @@
 """When a vehicle changed lanes, by hindsight: whole lane changes weighed against keeping the lane.
 
-A semi-Markov chain (Yu, "Hidden semi-Markov models", 2010): a vehicle keeps to the middle of a lane,
-and now and then moves to the middle of the next one within a few seconds, along a smooth course.
-Beside the course it wanders, and what is thought of the road is not quite right; both together are
-a Gaussian process with the Matern covariance of order 3/2 (state: place beside the course and its
-rate), known through a Kalman filter.  All courses have the same covariance in it, only the means
-differ, so that many courses can be followed at little cost.  Where a course ends in a lane, it is
-merged with the others that are in that lane by then.
+A semi-Markov chain (Yu, "Hidden semi-Markov models", 2010): a vehicle keeps to the middle of a
+lane, and now and then moves to the middle of the next one within a few seconds, along a smooth
+course.  Beside the course it wanders, and what is thought of the road is not quite right; both
+together are a Gaussian process with the Matern covariance of order 3/2 (state: place beside the
+course and its rate), known through a Kalman filter.  All courses have the same covariance in it,
+only the means differ, so that many courses can be followed at little cost.  Some time after a
+course ended in a lane, it is merged with the others that are in that lane by then.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ COURSE_DTYPE = np.dtype(
     align=True,
 )
 """A lane change that may have been: rows ``first`` to ``end`` - 1 lie in it, from ``merged`` on it
-is one with its new lane; it began at ``start`` and lasted ``duration`` [s], from ``lane`` (0 to `N_LANES` - 1) to that + ``turn``.  Logarithms of
-its prior probability where it begins, of the weight of what led there, and of the likelihood of
-what was measured during it (backwards: from its beginning to the track's end).  ``place``, ``rate``
-beside the course [m, m/s]."""
+is one with its new lane; it began at ``start`` and lasted ``duration`` [s], from ``lane`` (0 to
+`N_LANES` - 1) to that + ``turn``.  Logarithms of its prior probability where it begins, of the
+weight of what led there, and of the likelihood of what was measured during it (backwards: from its
+beginning to the track's end).  ``place``, ``rate`` beside the course [m, m/s]."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -194,7 +194,11 @@ def find_lane_changes_(
             d00, d11 = P00 - s00, P11 - s11
             g00, g01 = f00 * d00 + f01 * P01, f00 * P01 + f01 * d11
             g10, g11 = f10 * d00 + f11 * P01, f10 * P01 + f11 * d11
-            P00, P01, P11 = g00 * f00 + g01 * f01 + s00, g00 * f10 + g01 * f11, g10 * f10 + g11 * f11
+            P00, P01, P11 = (
+                g00 * f00 + g01 * f01 + s00,
+                g00 * f10 + g01 * f11,
+                g10 * f10 + g11 * f11,
+            )
             P11 += s11
             for lane in range(N_LANES):
                 alpha[k, lane] = alpha[k - 1, lane] + math.log1p(-min(RATE * dt, 0.5))

@@ -1,4 +1,4 @@
-"""How fast a vehicle went, by hindsight: paths of its speed drawn from all that fit the measurements.
+"""How fast a vehicle went, by hindsight: paths of its speed, drawn from all that may have been.
 
 A vehicle holds its speed, or speeds up or slows down at a rate that hardly changes meanwhile.  The
 three modes' filter (an interacting multiple model: Blom and Bar-Shalom, 1988) is followed forwards;
@@ -27,7 +27,7 @@ RAMP, RAMP_STD = 1.4, 0.8
 WEAKEST = 0.2
 """Ramps are about so strong at least [m/s²]."""
 RESTLESS, RESTLESS_RAMP, JERK = 0.0002, 0.0004, 0.003
-"""Densities of the noise of the speed, also in ramps [m²/s³], and of a ramp's acceleration [m²/s⁵]."""
+"""Densities of the noise of the speed, that in ramps [m²/s³], and of a ramp's rate [m²/s⁵]."""
 OUTLIER = 16.0
 """Squared normalised error of a measurement counts as this at most."""
 _TINY = 1e-8
@@ -80,7 +80,7 @@ def filter_speeds_(
     P: FloatArray,
     mu: FloatArray,
 ) -> None:  # pragma: no cover - compiled
-    """Forwards; arguments as for `draw_speeds_`, the rest written: (K, M, 3), (K, M, 3, 3), (K, M)."""
+    """Forwards; x (K, M, 3), P (K, M, 3, 3), mu (K, M) written, the rest as for `draw_speeds_`."""
     F, Q, Pi = np.eye(3), np.zeros((N_MODES, 3, 3)), np.zeros((N_MODES, N_MODES))
     a, A = np.zeros(3), np.zeros((3, 3))
     log_mu = np.zeros(N_MODES)
@@ -88,7 +88,7 @@ def filter_speeds_(
         if k > 0:
             models_(t[k] - t[k - 1], F, Q, Pi)
         for j in range(N_MODES):
-            c = 1.0 / N_MODES
+            prior = 1.0 / N_MODES
             if k == 0:
                 A[:] = np.diag(np.array([1e4, 30.0**2, 1.0]))
                 a[:] = 0.0
@@ -96,22 +96,22 @@ def filter_speeds_(
                 a[_V] = v[0] if v[0] == v[0] else 0.0
                 enter_(-1, j, a, A, x[0, j], P[0, j])
             else:
-                c = 0.0
+                prior = 0.0
                 mean, cov = np.zeros(3), np.zeros((3, 3))
                 for i in range(N_MODES):
-                    c += Pi[i, j] * mu[k - 1, i]
+                    prior += Pi[i, j] * mu[k - 1, i]
                 for i in range(N_MODES):
                     enter_(i, j, x[k - 1, i], P[k - 1, i], a, A)
-                    w = Pi[i, j] * mu[k - 1, i] / c
+                    w = Pi[i, j] * mu[k - 1, i] / prior
                     mean += w * a
                     cov += w * (A + np.outer(a, a))
                 cov -= np.outer(mean, mean)
                 x[k, j] = F @ mean
                 P[k, j] = F @ cov @ F.T + Q[j]
-            log_mu[j] = math.log(c)
+            log_mu[j] = math.log(prior)
             for c in (_S, _V):
                 z = s[k] if c == _S else v[k]
-                if not z == z:
+                if math.isnan(z):
                     continue
                 e = z - x[k, j, c]
                 var = P[k, j, c, c] + r[k, c]

@@ -26,7 +26,9 @@ def covariance(t: FloatArray) -> FloatArray:
     tau = t[:, None] - t[None, :]
     fade = BESIDE**2 * np.exp(-a * abs(tau))
     both = fade * a**2 * tau
-    return np.block([[fade * (1.0 + a * abs(tau)), both], [both.T, fade * a**2 * (1 - a * abs(tau))]])
+    return np.block(
+        [[fade * (1.0 + a * abs(tau)), both], [both.T, fade * a**2 * (1 - a * abs(tau))]]
+    )
 
 
 def written_out(t: FloatArray, y: FloatArray, vy: FloatArray | None) -> FloatArray:
@@ -81,9 +83,7 @@ def found(
     p = np.zeros((n, 2))
     rv = np.full(n, np.inf if vy is None else 0.3**2)
     speed = np.zeros(n) if vy is None else vy
-    lc.find_lane_changes_(
-        t, y, np.full(n, 0.2**2), speed, rv, np.full(n, beside), WIDTH, p
-    )
+    lc.find_lane_changes_(t, y, np.full(n, 0.2**2), speed, rv, np.full(n, beside), WIDTH, p)
     return p
 
 
@@ -103,7 +103,9 @@ def drive(
 @pytest.mark.parametrize(
     ("lane", "side", "start"), [(0, 1, 2.0), (1, -1, 3.0), (0, 0, 0.0), (0, 1, -2.5), (-1, -1, 5.5)]
 )
-def test_it_is_what_all_hypotheses_say(lane: int, side: int, start: float, with_speed: bool) -> None:
+def test_it_is_what_all_hypotheses_say(
+    lane: int, side: int, start: float, with_speed: bool
+) -> None:
     rng = np.random.default_rng([lane + 1, side + 1])
     t = np.arange(40) * 0.2 + rng.uniform(0.0, 0.05, 40)
     y, vy = drive(rng, t, lane, side, start, 4.2)
@@ -154,7 +156,7 @@ def test_two_changes_in_a_row() -> None:
 
 def test_a_single_row_and_outliers() -> None:
     p = found(np.array([3.0]), np.array([0.1]), np.array([0.0]))
-    assert 0.0 <= p.min()
+    assert p.min() >= 0.0
     assert p.sum() < 0.3
     rng = np.random.default_rng(1)
     t = np.arange(100) / 14.0

@@ -36,7 +36,9 @@ def test_a_constant_speed_is_that_of_the_best_line() -> None:
     s = 20.0 * t + 0.3 * rng.standard_normal(60)
     v = 20.0 + 0.3 * rng.standard_normal(60)
     speed, rate = draw(t, s, v, (0.3, 0.3))
-    design = np.concatenate((np.stack([np.ones(60), t], 1), np.stack([np.zeros(60), np.ones(60)], 1)))
+    design = np.concatenate(
+        (np.stack([np.ones(60), t], 1), np.stack([np.zeros(60), np.ones(60)], 1))
+    )
     cov = np.linalg.inv(design.T @ design / 0.09)
     best = cov @ design.T @ np.concatenate((s, v)) / 0.09
     middle = slice(20, 40)
