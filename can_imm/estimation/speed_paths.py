@@ -30,6 +30,8 @@ RESTLESS, RESTLESS_RAMP, JERK = 0.0002, 0.0004, 0.003
 """Densities of the noise of the speed, that in ramps [m²/s³], and of a ramp's rate [m²/s⁵]."""
 OUTLIER = 16.0
 """Squared normalised error of a measurement counts as this at most."""
+FARTHEST = 4.0
+"""A path's step back is that of a path no further from what was predicted [standard deviations]."""
 _TINY = 1e-8
 _S, _V, _A = 0, 1, 2
 
@@ -217,6 +219,12 @@ def draw_speeds_(
                 i += 1
             if b > 0:
                 e[:] = at[n] - px[i, j]
+                d2 = 0.0
+                for c in range(3):
+                    for d in range(3):
+                        d2 += e[c] * Si[i, j, c, d] * e[d]
+                # no path leads there by the filter, whose modes are Gaussians: back to it
+                e *= min(1.0, FARTHEST / math.sqrt(max(d2, _TINY)))
             for c in range(3):
                 at[n, c] = x[k, i, c]
                 if b > 0:
