@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from can_imm.ego_road import EgoHistory, RoadAtTheTime, RoadDriven, learn_ahead
+from can_imm.ego_road import BESIDE, DRIFT, EgoHistory, RoadAtTheTime, RoadDriven, learn_ahead
 from can_imm.estimation.road import BIAS, CURVATURE, HEADING, MOUNTING, OFFSET, WIDTH
 from can_imm.manoeuvres import load_bank
 from can_imm.road import RoadFrame
@@ -78,7 +78,7 @@ def test_the_road_is_where_the_ego_drives_later() -> None:
     np.testing.assert_allclose(place[:, 3], 0.0, atol=0.1)
     np.testing.assert_allclose(place[:, 1], SPEED, atol=0.2)
     np.testing.assert_allclose(np.diff(place[:, 0]), 5 * PERIOD * SPEED, atol=0.2)
-    assert (beside < 0.5).all()
+    np.testing.assert_allclose(beside, math.hypot(BESIDE, 120.0 * DRIFT), rtol=0.02)
     then, _ = RoadAtTheTime(ego, speed).place(scan, z, r)
     assert np.abs(then[:, 2] - LANE).max() > 0.7, "the filter could not know"
 
@@ -94,7 +94,7 @@ def test_beyond_the_last_place_nobody_knows() -> None:
     cov = np.diag(np.square([0.002, 1e-4, 1e-6]))
     speed = np.full(len(drive.t), SPEED)
     _, beside = RoadDriven(ego, speed, np.zeros(3), cov).place(scan, z, np.ones_like(z))
-    assert beside[0] < 0.4
+    assert beside[0] == pytest.approx(math.hypot(BESIDE, 60.0 * DRIFT), rel=0.02)
     assert beside[2] > beside[1] > beside[0]
     wrong = np.array([0.01, 0.0, 0.0])
     place, _ = RoadDriven(ego, speed, np.zeros(3), cov).place(scan, z, np.ones_like(z))
