@@ -74,9 +74,10 @@ class History(Protocol):
         ids: IntArray,
         measured: BoolArray,
         reports: np.ndarray[Any, np.dtype[np.void]],
-        road: FloatArray | None,
+        road: RoadFrame | None,
         moved: int,
-        ego_speed: float,
+        scan: Scan,
+        slot: IntArray,
     ) -> None:
         """A scan was used; all arrays are the detector's own and change with the next one.
 
@@ -86,9 +87,10 @@ class History(Protocol):
             ids: (capacity,) object id of each slot, -1 for a free one.
             measured: (capacity,) the slot was updated by this scan.
             reports: (n,) of the slots in use, in their order, in the road's axes and unrelated.
-            road: (31,) state of `estimation.road`, None without a road.
+            road: as it is after the scan, None without a road.
             moved: lanes that the ego has moved to the left since the last scan.
-            ego_speed: [m/s], NaN where unknown.
+            scan: what was measured.
+            slot: (N,) slot of each of the scan's rows, -1 for none.
         """
 
     def end(self, slot: int) -> None:
@@ -264,7 +266,7 @@ class Detector:
             if moved:
                 shift_lanes_(self._memory, moved)
         self._bury(now)
-        return self._report(t_ns, now, moved)
+        return self._report(t_ns, now, moved, scan)
 
     def _hear_ego(self, scan: Scan) -> None:
         """Take over the ego's motion, where the bus tells one that is possible."""
@@ -394,7 +396,7 @@ class Detector:
             self.reports,
         )
 
-    def _report(self, t_ns: int, now: int, moved: int) -> int:
+    def _report(self, t_ns: int, now: int, moved: int, scan: Scan) -> int:
         """Reports of all tracks; coasting ones are extrapolated."""
         n: int = self._fill(*self._report_arguments(t_ns))
         coasting = self.reports["coasting"]
@@ -406,7 +408,7 @@ class Detector:
         if self.history is not None:
             self.history.scan(
                 now, self._objects, self._id, self._measured, self.reports[:n],
-                None if self._road is None else self._road.x, moved, self._ego_speed,
+                self._road, moved, scan, self._slot,
             )  # fmt: skip
         if self._road is not None:
             self._road.doubt_(self._id, self._memory, self.reports)

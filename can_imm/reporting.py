@@ -49,6 +49,21 @@ def decide_(report: Any) -> int:
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def rear_end_share(gap: float, width: float, x: float, y: float, cov: FloatArray) -> float:
+    """Probability that an object at x, y [m] is no further away than a gap, in the ego's lane.
+
+    Args:
+        gap, width: of the lane [m].  cov: (n, n) of the state.
+    """
+    sx = math.sqrt(cov[0, 0])
+    sy = math.sqrt(cov[2, 2])
+    return math.exp(
+        normal_mass(-np.inf, (gap - x) / sx)
+        + normal_mass((-0.5 * width - y) / sy, (0.5 * width - y) / sy)
+    )
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def conclude_(
     bank: Any, width: float, mu: FloatArray, mean: FloatArray, cov: FloatArray, report: Any
 ) -> None:
@@ -70,12 +85,7 @@ def conclude_(
         report.p[bank.manoeuvre[j]] += mu[j]
         turn += mu[j] * bank.direction[j]
     if bank.rear_end_gap > 0.0:
-        sx = math.sqrt(cov[0, 0])
-        sy = math.sqrt(cov[2, 2])
-        near = math.exp(
-            normal_mass(-np.inf, (bank.rear_end_gap - mean[0]) / sx)
-            + normal_mass((-0.5 * width - mean[2]) / sy, (0.5 * width - mean[2]) / sy)
-        )
+        near = rear_end_share(bank.rear_end_gap, width, mean[0], mean[2], cov)
         report.p[_REAR_END] += near * report.p[_APPROACHING]
         report.p[_APPROACHING] *= 1.0 - near
     best = decide_(report)

@@ -37,6 +37,7 @@ class RoadFrame:
     Attributes:
         x, P: (N_ROAD,), (N_ROAD, N_ROAD) state and covariance of the filter at the last scan,
             without the guides.
+        speed, yaw_rate: of the ego at the last scan [m/s, rad/s], NaN where unknown.
     """
 
     def __init__(self, par: FloatArray) -> None:
@@ -50,7 +51,8 @@ class RoadFrame:
         self._first = 0
         self.x, self.P = self._past[: road.N_ROAD].copy(), self._without_guides()
         self._t_ns = -1
-        self._speed = math.nan
+        self.speed = math.nan
+        self.yaw_rate = math.nan
         self._h = np.zeros(road.N_ROAD + 1)
 
     @property
@@ -98,7 +100,8 @@ class RoadFrame:
         for passed in self._motion:
             self._pass(self.x, self.P, *passed)
         self._t_ns = t_ns
-        self._speed = speed
+        self.speed = speed
+        self.yaw_rate = yaw_rate
 
     def _pass(self, x: FloatArray, P: FloatArray, dt: float, speed: float, yaw_rate: float) -> None:
         if dt > 0.0:
@@ -107,7 +110,7 @@ class RoadFrame:
     def localise_(self, scan: Scan, z: FloatArray, r: FloatArray) -> None:
         """Measurements z, r (N, 4) of the scan into the road's axes, in place."""
         r[: scan.n, 2] += np.square(scan.lasting[: scan.n])
-        road.localise_(self.x, self.P, self._par, scan.n, z, r, scan.valid, scan.angle, self._speed)
+        road.localise_(self.x, self.P, self._par, scan.n, z, r, scan.valid, scan.angle, self.speed)
 
     def watch_(
         self, bank: ModeBank, objects: Any, scan: Scan, slot: Any, status: Any, age: Any
@@ -168,11 +171,11 @@ class RoadFrame:
 
         Without the ego's motion nothing is known of the road, and it is taken to be straight.
         """
-        if math.isnan(self._speed):
+        if math.isnan(self.speed):
             return
         doubtful = self._par[road.P_DOUBTFUL]
-        doubt_(self.x, self.P, doubtful, self._speed, self._h, ids, memory, reports)
+        doubt_(self.x, self.P, doubtful, self.speed, self._h, ids, memory, reports)
 
     def globalise_(self, reports: np.ndarray[Any, np.dtype[np.void]], n: int) -> None:
         """The first n reports from the road's axes into the sensor's, in place."""
-        globalise_(self.x, self._h, reports, n, self._speed)
+        globalise_(self.x, self._h, reports, n, self.speed)

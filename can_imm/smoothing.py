@@ -19,6 +19,7 @@ later measurement came.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,14 +28,16 @@ from typing import Any
 import numpy as np
 
 from can_imm.estimation.entry import entry_point
-from can_imm.estimation.road import N_ROAD, WIDTH
+from can_imm.estimation.road import N_ROAD, P_DOUBTFUL, P_SURE
 from can_imm.estimation.smoother import smooth_
 from can_imm.estimation.smoother_pairs import SMOOTHER_DTYPE
+from can_imm.hindsight import LOOK_AHEAD_S, Hindsight
 from can_imm.manoeuvres import ModeBank
-from can_imm.relations import MEMORY_DTYPE, relate_, shift_lanes_
-from can_imm.reporting import globalise_
-from can_imm.smoothing_rows import COASTING, FIRST, Reports, Rows, conclude_rows_
-from can_imm.types import REPORT_DTYPE, BoolArray, CanImmError, FloatArray, IntArray, Y
+from can_imm.relations import MEMORY_DTYPE, hesitate_, relate_, shift_lanes_
+from can_imm.reporting import doubt_, globalise_
+from can_imm.road import RoadFrame
+from can_imm.smoothing_rows import COASTING, FIRST, Reports, Rows, conclude_rows_, measurements
+from can_imm.types import REPORT_DTYPE, BoolArray, CanImmError, FloatArray, IntArray, Scan, Y
 
 TRUST = 0.3
 """How far the modes are taken at their word about where one ends and the next one begins, see
@@ -45,12 +48,16 @@ BLOCK, OVERLAP = 1024, 256
 """A track is smoothed in blocks of so many scans; what is said of the last ones of a block waits
 for the next block, so that they, too, know what came afterwards."""
 
+CONTEXT = 128
+"""So many scans of what was said are still looked at for the labels of the next block."""
+
 
 class _Track:
     """One track.
 
     Attributes:
         rows: its rows without the first ``base`` ones, which are forgotten.
+        told: the first of them of which nothing was said yet.
         last: number of the step of the last measurement, -1 before the first.
         said: number of rows that have been said.
         ended: nothing will be added.
@@ -61,6 +68,7 @@ class _Track:
         rows.n = 0
         self.rows = rows
         self.base = 0
+        self.told = 0
         self.last = -1
         self.said = 0
         self.ended = False
@@ -70,13 +78,14 @@ class _Track:
 @dataclass
 class _Scan:
     """A scan of which nothing has been said yet: its reports' tracks, their slots and their rows
-    counted from the tracks' first; the road, see `detector.History`."""
+    counted from the tracks' first; state and covariance of the road."""
 
     now: int
     tracks: list[_Track]
     slots: list[int]
     rows: list[int]
     road: FloatArray | None
+    road_cov: FloatArray
     moved: int
     ego_speed: float
 
@@ -93,10 +102,14 @@ class _Smoother:
         self._free: list[Rows] = []
         self._pending: deque[_Scan] = deque()
         self._shift = 0.0
+        self._hindsight: Hindsight | None = None
+        # parameters of the road, where lane changes are no surer than to the detector
+        self._road: FloatArray | None = None
         self._work = np.zeros(1, SMOOTHER_DTYPE)
         self._out: Reports = np.zeros(64, REPORT_DTYPE)
         # for the relations between the reports of a scan
         self._ids: IntArray = np.zeros(0, np.int32)
+        self._row_of = np.zeros(0, np.int64)
         self._memory = np.zeros(0, MEMORY_DTYPE)
         self._h: FloatArray = np.zeros(N_ROAD + 1)
         rows = self._take_rows()
@@ -115,45 +128,54 @@ class _Smoother:
         ids: IntArray,
         measured: BoolArray,
         reports: Reports,
-        road: FloatArray | None,
+        road: RoadFrame | None,
         moved: int,
-        ego_speed: float,
+        scan: Scan,
+        slot: IntArray,
     ) -> None:
         """Write a scan down; see `detector.History`."""
+        number = 0
+        noted = _Scan(now, [], np.flatnonzero(ids >= 0).tolist(), [], None, self._h, moved, np.nan)
         if road is not None:
             # the filter's lane 0 is now another one
-            self._shift += moved * float(road[WIDTH])
-            road = road.copy()
-        scan = _Scan(now, [], np.flatnonzero(ids >= 0).tolist(), [], road, moved, ego_speed)
+            self._shift += moved * road.width
+            noted.road, noted.road_cov = road.x.copy(), road.P.copy()
+            noted.ego_speed = road.speed
+            if self._hindsight is not None:
+                number = self._hindsight.add(now, road, self._shift)
         self._grow_slots(len(ids))
+        self._row_of[slot[: scan.n]] = range(scan.n)
+        z, r = measurements(scan)
         n_modes, n = self._shape
         x, P = objects["x"][:, :n_modes, :n], objects["P"][:, :n_modes, :n, :n]
         mu, Pi = objects["mu"][:, :n_modes], objects["Pi"][:, :n_modes, :n_modes]
         width = objects["lane_width"]
-        for row, slot in enumerate(scan.slots):
-            track = self._tracks.get(slot)
+        for row, place in enumerate(noted.slots):
+            track = self._tracks.get(place)
             if track is None:
-                self._tracks[slot] = track = _Track(self._take_rows())
+                self._tracks[place] = track = _Track(self._take_rows())
             rows = track.rows
             k = rows.n
-            scan.tracks.append(track)
-            scan.rows.append(track.base + k)
+            noted.tracks.append(track)
+            noted.rows.append(track.base + k)
             if k == len(rows.steps):
                 rows.grow()
             rows.n = k + 1
             rows.now[k] = now
             rows.said[k] = reports[row]
-            rows.width[k], rows.shift[k] = width[slot], self._shift
-            if not measured[slot]:
+            rows.width[k], rows.shift[k] = width[place], self._shift
+            rows.scan[k] = number
+            if not measured[place]:
                 rows.steps[k] = COASTING
                 continue
             rows.steps[k] = now - track.last if track.last >= 0 else FIRST
             track.last = now
-            rows.x[k], rows.P[k] = x[slot], P[slot]
-            rows.mu[k], rows.Pi[k] = mu[slot], Pi[slot]
+            rows.x[k], rows.P[k] = x[place], P[place]
+            rows.mu[k], rows.Pi[k] = mu[place], Pi[place]
+            rows.z[k], rows.r[k] = z[self._row_of[place]], r[self._row_of[place]]
             if self._shift != 0.0:
                 rows.x[k, :, Y] += self._shift
-        self._pending.append(scan)
+        self._pending.append(noted)
 
     def _take_rows(self) -> Rows:
         return self._free.pop() if self._free else Rows(64, *self._shape)
@@ -162,6 +184,7 @@ class _Smoother:
         """Room for a detector's slots; happens once, in the first scan."""
         if len(self._ids) < capacity:
             self._ids = np.full(capacity, -1, np.int32)
+            self._row_of = np.zeros(capacity, np.int64)
             self._memory = np.zeros(capacity, MEMORY_DTYPE)
             self._out = np.zeros(capacity, REPORT_DTYPE)
 
@@ -194,6 +217,13 @@ class _Smoother:
                 shift_lanes_(self._memory, scan.moved)
             self._ids[:] = -1
             self._ids[scan.slots] = reports["object_id"]
+            if self._road is not None:
+                if not math.isnan(scan.ego_speed):
+                    doubt_(
+                        scan.road, scan.road_cov, self._road[P_DOUBTFUL], scan.ego_speed,
+                        self._h, self._ids, self._memory, reports,
+                    )  # fmt: skip
+                hesitate_(self._ids, self._memory, self._road[P_SURE], reports, n)
             relate_(self._ids, self._memory, reports, n)
             globalise_(scan.road, self._h, reports, n, scan.ego_speed)
         return scan.now * self._step_ns, reports
@@ -201,6 +231,9 @@ class _Smoother:
 
 class FixedIntervalSmoother(_Smoother):
     """Smooths every track over its whole life; for recordings.
+
+    With a bank that has a road, the labels are those of `hindsight`, which knows where the ego went
+    on that road afterwards.
 
     While a track lives its modes are kept, 8 (M + n^2 + n + 1) M bytes per scan (6 kB with M = 16
     modes of n = 5 states), of `BLOCK` scans at most; then, and at its end, it is smoothed, and its
@@ -210,6 +243,14 @@ class FixedIntervalSmoother(_Smoother):
         bank: the detector's.
     """
 
+    def __init__(self, bank: ModeBank) -> None:
+        super().__init__(bank)
+        if bank.road is not None:
+            self._hindsight = Hindsight(bank.record)
+        self._now = 0
+        self._look_ahead = int(LOOK_AHEAD_S * 1e9) // bank.step_ns
+        self._ended: deque[tuple[int, _Track]] = deque()
+
     def scan(
         self,
         now: int,
@@ -217,22 +258,32 @@ class FixedIntervalSmoother(_Smoother):
         ids: IntArray,
         measured: BoolArray,
         reports: Reports,
-        road: FloatArray | None,
+        road: RoadFrame | None,
         moved: int,
-        ego_speed: float,
+        scan: Scan,
+        slot: IntArray,
     ) -> None:
         """Write a scan down; see `detector.History`."""
-        super().scan(now, objects, ids, measured, reports, road, moved, ego_speed)
+        super().scan(now, objects, ids, measured, reports, road, moved, scan, slot)
+        self._now = now
         for track in self._pending[-1].tracks:
-            if track.rows.n >= BLOCK:
-                self._release(track, track.rows.measured_before(BLOCK - OVERLAP))
+            if track.rows.n >= track.told + BLOCK:
+                last = track.told + BLOCK - OVERLAP
+                self._release(track, track.rows.measured_before(last))
+        while self._ended and self._ended[0][0] <= now:
+            self._release_ended()
+        if self._hindsight is not None:
+            tracks = [*self._tracks.values(), *(track for _, track in self._ended)]
+            if tracks:
+                self._hindsight.forget(min(int(track.rows.scan[0]) for track in tracks))
 
     def end(self, slot: int) -> None:
-        """Smooth the track that ended in this slot."""
+        """Smooth the track that ended in this slot, as soon as the road there is known."""
         track = self._tracks.pop(slot, None)
         if track is not None:
-            self._release(track, track.rows.n)
-            self._free.append(track.rows)
+            self._ended.append((self._now + self._look_ahead, track))
+            if self._hindsight is None:
+                self._release_ended()
 
     def due(self, t_ns: int = 0) -> Iterator[tuple[int, Reports]]:
         """Give out the scans of which all is known, in the order of time.
@@ -252,14 +303,28 @@ class FixedIntervalSmoother(_Smoother):
         """End all tracks and give out all that is left, as `due` does."""
         for slot in list(self._tracks):
             self.end(slot)
+        if self._hindsight is not None:
+            self._hindsight.look_ahead(track.rows for _, track in self._ended)
+        while self._ended:
+            self._release_ended()
         return self.due()
 
-    def _release(self, track: _Track, count: int) -> None:
-        """Smooth a track; its first ``count`` rows can be said and are forgotten."""
-        out = np.zeros(count, REPORT_DTYPE)
-        self._go_back(track.rows, 0, count, out)
+    def _release_ended(self) -> None:
+        track = self._ended.popleft()[1]
+        self._release(track, track.rows.n)
+        self._free.append(track.rows)
+
+    def _release(self, track: _Track, last: int) -> None:
+        """Smooth a track; what is before its row ``last`` can be said."""
+        rows = track.rows
+        out = np.zeros(last - track.told, REPORT_DTYPE)
+        self._go_back(rows, track.told, last, out)
+        if self._hindsight is not None:
+            self._hindsight.label_(rows, track.told, last, out)
         track.out = np.concatenate((track.out, out))
-        track.rows.drop(count)
+        forgotten = max(last - CONTEXT, 0) if self._hindsight is not None else last
+        rows.drop(forgotten)
+        track.told = last - forgotten
 
 
 class FixedLagSmoother(_Smoother):
@@ -280,6 +345,7 @@ class FixedLagSmoother(_Smoother):
         if self._lag < 1:
             raise CanImmError(f"the lag must be a step of the loop or longer, not {lag_s:g} s")
         super().__init__(bank)
+        self._road = bank.road
 
     def end(self, slot: int) -> None:
         """The track in this slot ended; what is pending of it will still be said."""
@@ -319,4 +385,5 @@ class FixedLagSmoother(_Smoother):
             if 2 * done >= len(rows.steps):
                 rows.drop(done)
                 track.base += done
-        return self._relate(scan, self._out[: len(scan.tracks)])
+        n = len(scan.tracks)
+        return self._relate(scan, self._out[:n])

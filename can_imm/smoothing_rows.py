@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numba
@@ -9,13 +10,43 @@ import numpy as np
 import numpy.typing as npt
 
 from can_imm.reporting import conclude_
-from can_imm.types import REPORT_DTYPE, VX, FloatArray, IntArray, X, Y
+from can_imm.types import REPORT_DTYPE, VX, VY, FloatArray, IntArray, Scan, X, Y
 
 Reports = npt.NDArray[Any]
 """Structured array of `can_imm.types.REPORT_DTYPE`."""
 
 FIRST, COASTING = -1, 0
 """Instead of a row's steps: it began the track; it was not measured."""
+
+
+ACROSS = 0.6
+"""Standard deviation of a speed across the line of sight that was not measured [m/s]."""
+
+
+def measurements(scan: Scan) -> tuple[FloatArray, FloatArray]:
+    """What a scan measured along the vehicle's axes.
+
+    Returns:
+        (N, 4) x, vx, y, vy [m, m/s, m, m/s]; (N, 4) variances, infinite where not measured.
+    """
+    n = scan.n
+    with np.errstate(over="ignore"):  # a row that is not used may say anything
+        r = np.where(scan.valid[:n], np.square(scan.std[:n]), np.inf)
+        r[:, Y] += np.square(scan.lasting[:n])
+    z = np.where(scan.valid[:n], scan.z[:n], 0.0)
+    for k in np.flatnonzero(scan.angle[:n]):
+        cos, sin = math.cos(scan.angle[k]), math.sin(scan.angle[k])
+        turn = np.array([[cos, -sin], [sin, cos]])
+        z[k, [X, Y]] = turn @ z[k, [X, Y]]
+        r[k, [X, Y]] = np.square(turn) @ r[k, [X, Y]]
+        if not np.isfinite(r[k, VY]):
+            # along the line of sight alone
+            z[k, [VX, VY]] = z[k, VX] / cos, 0.0
+            r[k, VX] = (r[k, VX] + (sin * ACROSS) ** 2) / cos**2
+            continue
+        z[k, [VX, VY]] = turn @ z[k, [VX, VY]]
+        r[k, [VX, VY]] = np.square(turn) @ r[k, [VX, VY]]
+    return z, r
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -99,6 +130,8 @@ class Rows:
         shift: the modes' y counts from a lane that does not change its number; what is said of y is
             less by this [m].
         said: what the detector reported.
+        scan: its number.
+        z, r: measured x, vx, y, vy [m, m/s, m, m/s], and variances, infinite where not measured.
         mean, cov, p: results.
     """
 
@@ -113,6 +146,9 @@ class Rows:
         self.width: FloatArray = np.zeros(size)
         self.shift: FloatArray = np.zeros(size)
         self.said: Reports = np.zeros(size, REPORT_DTYPE)
+        self.scan: npt.NDArray[np.int64] = np.zeros(size, np.int64)
+        self.z: FloatArray = np.zeros((size, 4))
+        self.r: FloatArray = np.zeros((size, 4))
         self.mean: FloatArray = np.zeros((size, n_states))
         self.cov: FloatArray = np.zeros((size, n_states, n_states))
         self.p: FloatArray = np.zeros((size, n_modes))

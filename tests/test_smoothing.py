@@ -10,8 +10,9 @@ import pytest
 
 from can_imm import smoothing
 from can_imm.detector import Detector
-from can_imm.estimation.road import N_ROAD, WIDTH
+from can_imm.estimation.road import WIDTH
 from can_imm.manoeuvres import load_bank
+from can_imm.road import RoadFrame
 from can_imm.smoothing import FixedIntervalSmoother, FixedLagSmoother
 from can_imm.smoothing_rows import fill_gap_
 from can_imm.studies.metrics import Metrics, evaluate
@@ -263,21 +264,25 @@ class LaneChange:
     def __init__(self, smoother: Any) -> None:
         self._smoother = smoother
         self._count = 0
+        par = load_bank("motorway").road
+        assert par is not None
+        self._road = RoadFrame(par)
+        self._road.x[:] = 0.0
+        self._road.x[WIDTH] = 3.5
+        self._road.speed = 20.0
 
     def scan(
         self, now: int, objects: Any, ids: Any, measured: Any, reports: Any,
-        road: Any, moved: int, ego_speed: float,
+        road: Any, moved: int, scan: Scan, slot: Any,
     ) -> None:  # fmt: skip
         assert road is None
         objects, reports = objects.copy(), reports.copy()
-        road = np.zeros(N_ROAD)
-        road[WIDTH] = 3.5
         if self._count >= 30:
             objects["x"][:, :, 2] -= 3.5
             objects["mean"][:, 2] -= 3.5
             reports["x"][:, 2] -= 3.5
         moved = int(self._count == 30)
-        self._smoother.scan(now, objects, ids, measured, reports, road, moved, 20.0)
+        self._smoother.scan(now, objects, ids, measured, reports, self._road, moved, scan, slot)
         self._count += 1
 
     def end(self, slot: int) -> None:

@@ -1,0 +1,353 @@
+"""When a vehicle changed lanes, by hindsight: whole lane changes weighed against keeping the lane.
+
+A semi-Markov chain (Yu, "Hidden semi-Markov models", 2010): a vehicle keeps to the middle of a
+lane, and now and then moves to the middle of the next one within a few seconds, along a smooth
+course.  Beside the course it wanders, and what is thought of the road is not quite right; both
+together are a Gaussian process with the Matern covariance of order 3/2 (state: place beside the
+course and its rate), known through a Kalman filter.  All courses have the same covariance in it,
+only the means differ, so that many courses can be followed at little cost.  Some time after a
+course ended in a lane, it is merged with the others that are in that lane by then.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+
+from can_imm.types import FloatArray
+
+RATE = 0.03
+"""Lane changes of a vehicle [1/s]."""
+SHORTEST, LONGEST = 2.5, 7.5
+N_DURATIONS = 11
+"""Durations of lane changes that are tried [s]."""
+USUAL, SPREAD = 4.3, 0.24
+"""Median of the durations [s], and standard deviation of their logarithm."""
+STEADY, STEADY_TIME = 0.1, 0.6
+"""Share of the lane changes at a constant rate, as in the published scenario, and how long they
+last in units of the usual durations."""
+HURRY = 0.5
+"""How fast the place beside the course is forgotten [1/s]: rate of the Matern process."""
+IMPOSSIBLE = 18.0
+"""A course whose log weight is so much lower than that of the best one is given up."""
+OUTLIER = 16.0
+"""Squared normalised error of a measurement counts as this at most."""
+SETTLE = 1.0
+"""So long after its end [s] a course is still followed on its own: whether it ended too early shows
+only then."""
+EDGE = 12
+"""Lanes are numbered from -EDGE to EDGE."""
+N_LANES = 2 * EDGE + 1
+N_BEGUN = 8
+"""Courses that had begun before the first measurement are tried from so many beginnings."""
+UNKNOWN = 1e6
+"""A measurement with a larger variance is none."""
+
+COURSE_DTYPE = np.dtype(
+    [
+        ("first", np.int64),
+        ("end", np.int64),
+        ("merged", np.int64),
+        ("start", np.float64),
+        ("duration", np.float64),
+        ("lane", np.int64),
+        ("turn", np.int64),
+        ("steady", np.bool_),
+        ("log_prior", np.float64),
+        ("log_before", np.float64),
+        ("log_like", np.float64),
+        ("place", np.float64),
+        ("rate", np.float64),
+    ],
+    align=True,
+)
+"""A lane change that may have been: rows ``first`` to ``end`` - 1 lie in it, from ``merged`` on it
+is one with its new lane; it began at ``start`` and lasted ``duration`` [s], from ``lane`` (0 to
+`N_LANES` - 1) to that + ``turn``, at a constant rate if ``steady``.  Logarithms of its prior
+probability where it begins, of the weight of what led there, and of the likelihood of what was
+measured during it (backwards: from its beginning to the track's end).  ``place``, ``rate`` beside
+the course [m, m/s]."""
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def course(u: float, steady: bool) -> tuple[float, float]:  # pragma: no cover - compiled
+    """How much of the way is done at the share u of the time (0 or more), and its derivative by u.
+
+    At a constant rate, or between a quintic polynomial and half a cosine wave, which differ by 2 %
+    of the way.
+    """
+    if u >= 1.0:
+        return 1.0, 0.0
+    if steady:
+        return u, 1.0
+    quintic = u * u * u * (10.0 - 15.0 * u + 6.0 * u * u)
+    slope = 30.0 * u * u * (1.0 - u) * (1.0 - u)
+    cosine = 0.5 - 0.5 * math.cos(math.pi * u)
+    wave = 0.5 * math.pi * math.sin(math.pi * u)
+    return 0.5 * (quintic + cosine), 0.5 * (slope + wave)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def add_logs(a: float, b: float) -> float:  # pragma: no cover - compiled
+    """log(exp(a) + exp(b))"""
+    if a < b:
+        a, b = b, a
+    return a + math.log1p(math.exp(b - a)) if b > -np.inf else a
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def grown(courses: Any) -> Any:  # pragma: no cover - compiled
+    """The same courses with twice the room."""
+    more = np.zeros(2 * len(courses), COURSE_DTYPE)
+    for c in range(len(courses)):
+        more[c] = courses[c]
+    return more
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def usual_durations() -> tuple[FloatArray, FloatArray]:  # pragma: no cover - compiled
+    """Durations (N,) of lane changes [s] and logarithms (N,) of their prior probabilities."""
+    duration, log_p = np.empty(N_DURATIONS), np.empty(N_DURATIONS)
+    for i in range(N_DURATIONS):
+        duration[i] = SHORTEST * (LONGEST / SHORTEST) ** (i / (N_DURATIONS - 1))
+        log_p[i] = -0.5 * (math.log(duration[i] / USUAL) / SPREAD) ** 2
+    return duration, log_p - math.log(np.sum(np.exp(log_p)))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def begin_(
+    course: Any,
+    first: int,
+    end: int,
+    start: float,
+    duration: float,
+    lane: int,
+    turn: int,
+    steady: bool,
+) -> None:  # pragma: no cover - compiled
+    """Where and when a course runs; the rest is 0."""
+    course.first, course.end, course.merged = first, end, end
+    course.start, course.duration = start, duration
+    course.lane, course.turn, course.steady = lane, turn, steady
+    course.log_prior = course.log_before = course.log_like = 0.0
+    course.place = course.rate = 0.0
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def find_lane_changes_(
+    t: FloatArray,
+    y: FloatArray,
+    r: FloatArray,
+    vy: FloatArray,
+    rv: FloatArray,
+    beside: FloatArray,
+    width: float,
+    p: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """Probability that a vehicle was changing lanes, by all that was measured of it.
+
+    Args:
+        t: (K,) ascending [s].
+        y, vy: (K,) place and speed across the road [m, m/s]; the middles of lanes lie at multiples
+            of the width.  r, rv: (K,) variances, infinite where not measured.
+        beside: (K,) standard deviation of the place beside the course [m].
+        width: of the lanes [m].
+        p: (K, 2) written: changing to the left, to the right.
+    """
+    n = len(t)
+    # logarithms: weight of being in a lane by what was measured until then, likelihood of the
+    # measurement there, likelihood of all that was measured afterwards
+    alpha = np.zeros((n, N_LANES))
+    like = np.zeros((n, N_LANES))
+    beta = np.zeros((n, N_LANES))
+    place, rate = np.zeros(N_LANES), np.zeros(N_LANES)
+    duration, log_p = usual_durations()
+    courses = np.zeros(4096, COURSE_DTYPE)
+    active = np.zeros(4096, np.int64)
+    count = n_active = 0
+    P00, P01, P11 = beside[0] ** 2, 0.0, (HURRY * beside[0]) ** 2
+    f00, f01, f10, f11 = 1.0, 0.0, 0.0, 1.0
+    best = 0.0
+    for k in range(n):
+        # what may begin
+        dt = t[k] - t[max(k - 1, 0)]
+        for lane in range(1, N_LANES - 1):
+            if k > 0 and alpha[k - 1, lane] < best - IMPOSSIBLE:
+                continue
+            for turn in (-1, 1):
+                # at first only what passes the place where the vehicle is
+                off = y[k] / width - (lane - EDGE + 0.5 * turn)
+                if k == 0 and abs(off) > 1.0:
+                    continue
+                for i in range(2 * N_DURATIONS):
+                    steady = i >= N_DURATIONS
+                    lasts = duration[i % N_DURATIONS] * (STEADY_TIME if steady else 1.0)
+                    share = math.log(STEADY if steady else 1.0 - STEADY)
+                    for b in range(1 if k > 0 else N_BEGUN):
+                        if count == len(courses):
+                            courses = grown(courses)
+                            active = np.concatenate((active, np.zeros_like(active)))
+                        start = t[k] - 0.5 * dt
+                        span = dt
+                        if k == 0:
+                            start = t[0] - (b + 0.5) / N_BEGUN * lasts
+                            span = lasts / N_BEGUN
+                        c = courses[count]
+                        begin_(c, k, n, start, lasts, lane, turn, steady)
+                        c.log_prior = math.log(0.5 * RATE * span) + log_p[i % N_DURATIONS] + share
+                        if k > 0:
+                            c.log_before = alpha[k - 1, lane]
+                            c.place, c.rate = place[lane], rate[lane]
+                        active[n_active] = count
+                        n_active += 1
+                        count += 1
+        # on to this row
+        if k > 0:
+            fade = math.exp(-HURRY * dt)
+            f00, f01 = (1.0 + HURRY * dt) * fade, dt * fade
+            f10, f11 = -HURRY * HURRY * dt * fade, (1.0 - HURRY * dt) * fade
+            # F (P - S) F' + S, S the stationary covariance
+            s00, s11 = beside[k] ** 2, (HURRY * beside[k]) ** 2
+            d00, d11 = P00 - s00, P11 - s11
+            g00, g01 = f00 * d00 + f01 * P01, f00 * P01 + f01 * d11
+            g10, g11 = f10 * d00 + f11 * P01, f10 * P01 + f11 * d11
+            P00, P01, P11 = (
+                g00 * f00 + g01 * f01 + s00,
+                g00 * f10 + g01 * f11,
+                g10 * f10 + g11 * f11,
+            )
+            P11 += s11
+            for lane in range(N_LANES):
+                alpha[k, lane] = alpha[k - 1, lane] + math.log1p(-min(RATE * dt, 0.5))
+                a, b = place[lane], rate[lane]
+                place[lane], rate[lane] = f00 * a + f01 * b, f10 * a + f11 * b
+        kept = 0
+        for q in range(n_active):
+            c = courses[active[q]]
+            a, b = c.place, c.rate
+            c.place, c.rate = f00 * a + f01 * b, f10 * a + f11 * b
+            since = t[k] - c.start - c.duration
+            if since >= 0.0 and c.end == n:
+                c.end = k
+            if since < SETTLE:
+                active[kept] = active[q]
+                kept += 1
+                continue
+            c.merged = k
+            to = c.lane + c.turn
+            log_w = c.log_before + c.log_prior + c.log_like
+            total = add_logs(alpha[k, to], log_w)
+            w = math.exp(log_w - total)
+            place[to] += w * (c.place - place[to])
+            rate[to] += w * (c.rate - rate[to])
+            alpha[k, to] = total
+        n_active = kept
+        # the measurement
+        var_y, k0, k1 = 1.0, 0.0, 0.0
+        if r[k] < UNKNOWN:
+            var_y = P00 + r[k]
+            k0, k1 = P00 / var_y, P01 / var_y
+        P00, P01, P11 = P00 - k0 * P00, P01 - k0 * P01, P11 - k1 * P01
+        var_v, h0, h1 = 1.0, 0.0, 0.0
+        if rv[k] < UNKNOWN:
+            var_v = P11 + rv[k]
+            h0, h1 = P01 / var_v, P11 / var_v
+        P00, P01, P11 = P00 - h0 * P01, P01 - h0 * P11, P11 - h1 * P11
+        scale = -0.5 * (math.log(var_y) + math.log(var_v))
+        best = -np.inf
+        for lane in range(N_LANES):
+            log_l = scale
+            if r[k] < UNKNOWN:
+                e = y[k] - (lane - EDGE) * width - place[lane]
+                log_l -= 0.5 * min(e * e / var_y, OUTLIER)
+                place[lane] += k0 * e
+                rate[lane] += k1 * e
+            if rv[k] < UNKNOWN:
+                e = vy[k] - rate[lane]
+                log_l -= 0.5 * min(e * e / var_v, OUTLIER)
+                place[lane] += h0 * e
+                rate[lane] += h1 * e
+            like[k, lane] = log_l
+            alpha[k, lane] += log_l
+            best = max(best, alpha[k, lane])
+        for q in range(n_active):
+            c = courses[active[q]]
+            done, slope = course((t[k] - c.start) / c.duration, c.steady)
+            log_l = scale
+            if r[k] < UNKNOWN:
+                e = y[k] - (c.lane - EDGE + c.turn * done) * width - c.place
+                log_l -= 0.5 * min(e * e / var_y, OUTLIER)
+                c.place += k0 * e
+                c.rate += k1 * e
+            if rv[k] < UNKNOWN:
+                e = vy[k] - c.turn * slope * width / c.duration - c.rate
+                log_l -= 0.5 * min(e * e / var_v, OUTLIER)
+                c.place += h0 * e
+                c.rate += h1 * e
+            c.log_like += log_l
+            best = max(best, c.log_before + c.log_prior + c.log_like)
+        kept = 0
+        for q in range(n_active):
+            c = courses[active[q]]
+            if c.log_before + c.log_prior + c.log_like < best - IMPOSSIBLE:
+                c.log_like = -np.inf
+            else:
+                active[kept] = active[q]
+                kept += 1
+        n_active = kept
+    look_back_(t, alpha, like, beta, courses, count, p)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def look_back_(
+    t: FloatArray,
+    alpha: FloatArray,
+    like: FloatArray,
+    beta: FloatArray,
+    courses: Any,
+    count: int,
+    p: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """The backward half of `find_lane_changes_`; see there."""
+    n = len(t)
+    total = -np.inf
+    c = count - 1
+    for q in range(n):
+        # courses are in the order of their first rows
+        k = n - 1 - q
+        if k < n - 1:
+            stay = math.log1p(-min(RATE * (t[k + 1] - t[k]), 0.5))
+            for lane in range(N_LANES):
+                beta[k, lane] = stay + like[k + 1, lane] + beta[k + 1, lane]
+        while c >= 0 and courses[c].first > k:
+            lane = courses[c].lane
+            add_rest_(courses[c], n, like, beta)
+            beta[k, lane] = add_logs(beta[k, lane], courses[c].log_prior + courses[c].log_like)
+            c -= 1
+    for lane in range(N_LANES):
+        total = add_logs(total, alpha[0, lane] + beta[0, lane])
+    while c >= 0:
+        add_rest_(courses[c], n, like, beta)
+        total = add_logs(total, courses[c].log_prior + courses[c].log_like)
+        c -= 1
+    p[:] = 0.0
+    for c in range(count):
+        one = courses[c]
+        log_w = one.log_before + one.log_prior + one.log_like - total
+        if log_w > -IMPOSSIBLE:
+            side = 0 if one.turn > 0 else 1
+            for k in range(one.first, one.end):
+                p[k, side] += math.exp(log_w)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def add_rest_(
+    course: Any, n: int, like: FloatArray, beta: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """Add what was measured after a course became one with its lane."""
+    if course.merged < n:
+        to = course.lane + course.turn
+        course.log_like += like[course.merged, to] + beta[course.merged, to]
