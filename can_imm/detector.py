@@ -206,7 +206,10 @@ class Detector:
         scan = Scan(1)
         self._grow_rows(self.capacity)
         if self._road is not None:
-            self._road.warm_up(self._id, self._memory, self.reports)
+            self._road.warm_up(
+                self.bank, self._objects, self._slot, self._status, self._age,
+                self._id, self._memory, self.reports,
+            )  # fmt: skip
         hesitate_(self._id, self._memory, 0.5, self.reports, 0)
         relate_(self._id, self._memory, self.reports, 0)
         shift_lanes_(self._memory, 0)

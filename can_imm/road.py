@@ -68,16 +68,22 @@ class RoadFrame:
     def _without_guides(self) -> FloatArray:
         return self._P_past[: road.N_ROAD, : road.N_ROAD].copy()
 
-    def warm_up(self, ids: IntArray, memory: Any, reports: np.ndarray[Any, Any]) -> None:
-        """Compile, or load from the cache; no slot may be in use."""
-        scan = Scan(1)
-        for x, P in ((self.x.copy(), self.P.copy()), (self._past.copy(), self._P_past.copy())):
-            road.predict_road_(x, P, self._par, 0.1, 20.0, 0.0)
-            guides.change_lane_(x, P, self._guide_slot, 0, self.width)
-        road.localise_(x, P, self._par, 0, scan.z, scan.std, scan.valid, scan.angle, 20.0)
-        road.turn_with_road_(x, P, self._par, 20.0, 0.0, 1.0)
-        road.place(x, self._h, 0.0, 0.0, 20.0)
-        doubt_(x, P, 1.0, 20.0, self._h, ids, memory, reports)
+    def warm_up(
+        self, bank: ModeBank, objects: Any, slot: Any, status: Any, age: Any,
+        ids: IntArray, memory: Any, reports: np.ndarray[Any, Any],
+    ) -> None:  # fmt: skip
+        """Compile, or load from the cache, all that a scan needs: by a drive of another ego past
+        nobody.  No slot may be in use."""
+        other, scan = RoadFrame(self._par), Scan(1)
+        for t_ns in (0, 100_000_000):
+            other.move(t_ns, 20.0, 0.0)
+            other.localise_(scan, scan.z, scan.std)
+            other.watch_(bank, objects, scan, slot, status, age)
+            other.doubt_(ids, memory, reports)
+            other.globalise_(reports, 0)
+        for x, P in ((other.x, other.P), (other._past, other._P_past)):
+            guides.change_lane_(x, P, other._guide_slot, 0, other.width)
+        guides.shift_objects_(bank.record, objects, 0.0)
 
     def move(self, t_ns: int, speed: float, yaw_rate: float) -> None:
         """Move the ego on to the time of the next scan.

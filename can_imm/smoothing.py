@@ -144,7 +144,8 @@ class _Smoother:
             if self._hindsight is not None:
                 number = self._hindsight.add(now, road, self._shift)
         self._grow_slots(len(ids))
-        self._row_of[slot[: scan.n]] = range(scan.n)
+        rows_of_slots = np.flatnonzero(slot[: scan.n] >= 0)
+        self._row_of[slot[rows_of_slots]] = rows_of_slots
         z, r = measurements(scan)
         n_modes, n = self._shape
         x, P = objects["x"][:, :n_modes, :n], objects["P"][:, :n_modes, :n, :n]

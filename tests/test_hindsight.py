@@ -7,16 +7,18 @@ import math
 import numpy as np
 import pytest
 
+from can_imm.detector import Detector
 from can_imm.ego_road import BESIDE, DRIFT, EgoHistory, RoadAtTheTime, RoadDriven, learn_ahead
 from can_imm.estimation.road import BIAS, HEADING, KNOT, MOUNTING, OFFSET, WIDTH
 from can_imm.manoeuvres import load_bank
 from can_imm.road import RoadFrame
 from can_imm.sim.motorway import TUNING, plain
 from can_imm.sim.road import Road
+from can_imm.smoothing import FixedIntervalSmoother
 from can_imm.studies.motorway import detector_says
 from can_imm.studies.motorway_metrics import Score, score
 from can_imm.studies.motorway_runs import MotorwayRun, play_motorway
-from can_imm.types import FloatArray
+from can_imm.types import FloatArray, Manoeuvre, Scan
 
 BANK = load_bank("motorway")
 SPEED, PERIOD, LANE = 30.0, 0.07, 3.6
@@ -176,3 +178,21 @@ def test_without_the_ego_s_motion_too(runs: list[MotorwayRun]) -> None:
     assert later is not None
     assert later.metrics.accuracy > 0.97
     assert later.metrics.accuracy > causal.metrics.accuracy + 0.01
+
+
+def test_a_vehicle_without_a_slot_is_not_taken_for_another() -> None:
+    """There is room for one; the other drives away in the next lane."""
+    detector = Detector(BANK, capacity=1)
+    detector.history = smoother = FixedIntervalSmoother(BANK)
+    scan, said = Scan(2), []
+    scan.n, scan.ids[:], scan.valid[:], scan.std[:] = 2, (7, 8), True, 0.1
+    scan.ego_speed, scan.ego_yaw_rate = 30.0, 0.0
+    for k in range(60):
+        scan.t_ns = k * 70_000_000
+        scan.z[:] = [(40.0, 0.0, 0.0, 0.0), (60.0 + 0.35 * k, 5.0, BANK.lane_width, 0.0)]
+        detector.step(scan.t_ns, scan)
+    assert detector.counts.overflow > 0
+    for _, reports in smoother.finish():
+        assert reports["object_id"].tolist() == [7]
+        said += reports["manoeuvre"].tolist()
+    assert set(said) == {Manoeuvre.KEEP_LANE}

@@ -190,6 +190,20 @@ def learn_(
         if not note.seen:
             continue
         x, y, noise = note.x, note.y, note.noise
+        if note.off > 0.5 or not 0.0 < x < SEEN_TO:
+            if g != FREE:
+                guide_slot[g] = FREE
+                free_guide_(P, road, g)
+            continue
+        lane_row_(h, road[WAY], x)
+        if g == FREE:
+            for other in range(N_GUIDES):
+                if guide_slot[other] == FREE:
+                    guide_slot[other] = s
+                    guide_unseen[other] = 0.0
+                    begin_guide_(road, P, h, other, y, noise)
+                    break
+            continue
         moving = note.changing
         for k in range(1, later + 1):
             after = notes[(first + k) % notes.shape[0], s]
@@ -197,23 +211,6 @@ def learn_(
                 break  # the slot has another object
             if after.seen:
                 moving = max(moving, after.changing)
-        lane_row_(h, road[WAY], x)
-        if g == FREE or note.off > 0.5 or not 0.0 < x < SEEN_TO:
-            if g != FREE:
-                guide_slot[g] = FREE
-                free_guide_(P, road, g)
-            if note.off > 0.5 or not 0.0 < x < SEEN_TO:
-                continue
-            if g == FREE:
-                for other in range(N_GUIDES):
-                    if guide_slot[other] == FREE:
-                        g = other
-                        break
-            if g != FREE:
-                guide_slot[g] = s
-                guide_unseen[g] = 0.0
-                begin_guide_(road, P, h, g, y, noise)
-            continue
         guide_unseen[g] = 0.0
         a = N_ROAD + g
         free = par[P_FREEDOM] * (1.0 - moving) + par[P_FREEDOM_CHANGING] * moving

@@ -83,7 +83,7 @@ the offset; ``wander_std`` [m] and ``wander_time`` [s] of a vehicle in its lane;
 of its place, and while it changes lanes; ``*_weight``: by how much more the variances of this
 estimate count than those of white noise, since its errors last; ``*_most`` [m, m/s]: no larger
 error is added to the measurements' noise: however little is known of where the lanes are far ahead,
-that a vehicle moves across them is seen; ``doubtful`` [m]: see `reporting.doubt_`; ``hindsight``
+that a vehicle moves across them is seen; ``doubtful`` [m/s]: see `reporting.doubt_`; ``hindsight``
 [s]: see `estimation.guides`; ``sure``: see `relations.hesitate_`.
 """
 (
