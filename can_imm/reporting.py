@@ -10,7 +10,7 @@ import numpy as np
 
 from can_imm.estimation.constraints import normal_mass
 from can_imm.estimation.imm import extrapolate_
-from can_imm.estimation.road import WAY, place, slope_row_, variance
+from can_imm.estimation.road import place
 from can_imm.types import FloatArray, Manoeuvre
 
 _LANE_CHANGE = int(Manoeuvre.LANE_CHANGE)
@@ -18,16 +18,15 @@ _APPROACHING = int(Manoeuvre.APPROACHING)
 _REAR_END = int(Manoeuvre.REAR_END)
 _RECEDING = int(Manoeuvre.RECEDING)
 _KEEP_LANE = int(Manoeuvre.KEEP_LANE)
+_STATIONARY = int(Manoeuvre.STATIONARY)
+_ONCOMING = int(Manoeuvre.ONCOMING)
 
 STEADY = 0.6
 """Up to this relative speed [m/s] an object is about as fast as the ego."""
 
 
-OVER = 0.2
-"""A lane change that is less probable is over."""
-
-WANDER_SPEED = 0.1
-"""Lateral speed of vehicles that keep their lane [m/s]."""
+LEAST = 1e-4
+"""Where less is left for all that is no lane change, the speed tells what it would be."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -184,53 +183,36 @@ def globalise_(road: FloatArray, h: FloatArray, reports: Any, n: int, speed: flo
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def doubt_(
-    road: FloatArray,
-    P: FloatArray,
-    doubtful: float,
-    speed: float,
-    h: FloatArray,
-    ids: Any,
-    memory: Any,
-    reports: Any,
-) -> None:
-    """Trust lane changes no further than the road is known, in place.
+def judge_changes_(p: FloatArray, reports: Any, n: int) -> None:
+    """Say of the first n reports whether they change lanes, in place.
 
-    A vehicle that keeps its lane where the road bends unseen moves across the lane where the road
-    is expected: with a lateral speed that is normal, of the uncertainty of the road's direction
-    times the vehicle's speed.  By how much likelier than that a lane change makes the lateral
-    speed, so much of its probability stays; the rest goes to what its speed makes of the object.
-    The trust stays until the lane change is over, however slowly it ends.
+    The probability of what else they do stays as it is, but for the common factor.
 
     Args:
-        road, P: (N_ROAD,), (N_ROAD, N_ROAD) state and covariance of `estimation.road`.
-        doubtful: how much likelier lanes are kept than changed, times the spread of the lateral
-            speeds of lane changes [m/s].
-        speed: of the ego [m/s].
-        h: (N_ROAD,) scratch.
-        ids: (capacity,) object id of each slot, -1 for a free one.
-        memory: (capacity,) of `relations.MEMORY_DTYPE`.
+        p: (n, 2) probabilities of changing to the left and to the right, see `estimation.changing`;
+            NaN where nothing is known: there the report is left alone.
     """
-    k = -1
-    for s in range(ids.shape[0]):
-        if ids[s] < 0:
+    for k in range(n):
+        if p[k, 0] != p[k, 0]:
             continue
-        k += 1
         report = reports[k]
-        p = report.p[_LANE_CHANGE]
-        if report.age <= 1 or p < OVER:
-            memory[s].trust = 0.0
-        if p < 0.01:
-            continue
-        slope_row_(h, road[WAY], report.x[0])
-        s2 = WANDER_SPEED**2 + variance(P, h) * (speed + report.x[1]) ** 2
-        kept = doubtful * math.exp(-0.5 * report.x[3] ** 2 / s2) / math.sqrt(s2)
-        share = max(1.0 / (1.0 + kept), memory[s].trust)
-        memory[s].trust = share
-        other = _KEEP_LANE
-        if abs(report.x[1]) > STEADY:
-            other = _RECEDING if report.x[1] > 0.0 else _APPROACHING
-        report.p[_LANE_CHANGE] = share * p
-        report.p[other] += (1.0 - share) * p
-        if decide_(report) != _LANE_CHANGE:
-            report.direction = 0
+        change = p[k, 0] + p[k, 1]
+        others = ours = 0.0
+        for i in range(1, report.p.shape[0]):
+            if i != _STATIONARY and i != _ONCOMING:
+                ours += report.p[i]
+                if i != _LANE_CHANGE:
+                    others += report.p[i]
+        if others > LEAST:
+            for i in range(1, report.p.shape[0]):
+                if i != _STATIONARY and i != _ONCOMING and i != _LANE_CHANGE:
+                    report.p[i] *= ours * (1.0 - change) / others
+        else:
+            other = _KEEP_LANE
+            if abs(report.x[1]) > STEADY:
+                other = _RECEDING if report.x[1] > 0.0 else _APPROACHING
+            report.p[other] = ours * (1.0 - change)
+        report.p[_LANE_CHANGE] = ours * change
+        report.direction = 0
+        if decide_(report) == _LANE_CHANGE:
+            report.direction = 1 if p[k, 0] > p[k, 1] else -1

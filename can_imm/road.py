@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from can_imm.estimation import guides, road
-from can_imm.reporting import doubt_, globalise_
+from can_imm.estimation.changing import (
+    CHANGES_DTYPE,
+    follow_all_,
+    probabilities,
+    shift_changes_,
+    tell_changes_,
+)
+from can_imm.reporting import globalise_, judge_changes_
 from can_imm.types import VY, FloatArray, IntArray, Scan
 
 if TYPE_CHECKING:
@@ -45,6 +52,8 @@ class RoadFrame:
         self._guide_slot = np.full(road.N_GUIDES, road.FREE, np.int32)
         self._guide_unseen = np.zeros(road.N_GUIDES)
         self._notes: np.ndarray[Any, np.dtype[np.void]] = np.zeros((SCANS, 0), guides.NOTE_DTYPE)
+        self._changes: np.ndarray[Any, np.dtype[np.void]] = np.zeros(0, CHANGES_DTYPE)
+        self._p: FloatArray = np.zeros((0, 2))
         # the filter as of the last scan that was learnt from; the ego's motion of those since
         self._past, self._P_past = road.new_road(par)
         self._motion: deque[tuple[float, float, float]] = deque()
@@ -70,7 +79,7 @@ class RoadFrame:
 
     def warm_up(
         self, bank: ModeBank, objects: Any, slot: Any, status: Any, age: Any,
-        ids: IntArray, memory: Any, reports: np.ndarray[Any, Any],
+        ids: IntArray, reports: np.ndarray[Any, Any],
     ) -> None:  # fmt: skip
         """Compile, or load from the cache, all that a scan needs: by a drive of another ego past
         nobody.  No slot may be in use."""
@@ -79,10 +88,11 @@ class RoadFrame:
             other.move(t_ns, 20.0, 0.0)
             other.localise_(scan, scan.z, scan.std)
             other.watch_(bank, objects, scan, slot, status, age)
-            other.doubt_(ids, memory, reports)
+            other.judge_changes_(ids, reports, t_ns)
             other.globalise_(reports, 0)
         for x, P in ((other.x, other.P), (other._past, other._P_past)):
             guides.change_lane_(x, P, other._guide_slot, 0, other.width)
+        shift_changes_(other._changes, 1)
         guides.shift_objects_(bank.record, objects, 0.0)
 
     def move(self, t_ns: int, speed: float, yaw_rate: float) -> None:
@@ -129,6 +139,9 @@ class RoadFrame:
         """
         if self._notes.shape[1] != len(objects):
             self._notes = np.zeros((SCANS, len(objects)), guides.NOTE_DTYPE)
+            self._changes = np.zeros(len(objects), CHANGES_DTYPE)
+            self._changes["t"] = np.nan
+            self._p = np.zeros((len(objects), 2))
         with np.errstate(over="ignore"):  # a row that is not used may say anything
             r = np.square(scan.std)
             r[:, 2] += np.square(scan.lasting)
@@ -145,6 +158,11 @@ class RoadFrame:
             guides.change_lane_(self.x, self.P, self._guide_slot, moved, width)
             guides.change_lane_(self._past, self._P_past, self._guide_slot, moved, width)
             guides.shift_objects_(bank.record, objects, moved * width)
+            shift_changes_(self._changes, moved)
+        follow_all_(
+            self._changes, self.x, self.P, self._par, scan.t_ns * 1e-9, self.speed,
+            self._notes[last], scan.n, slot, scan.z, r, scan.valid, scan.angle,
+        )  # fmt: skip
         return moved
 
     def _learn(self, soon: bool) -> None:
@@ -172,15 +190,22 @@ class RoadFrame:
         if not self._motion:
             self.x, self.P = self._past[: road.N_ROAD].copy(), self._without_guides()
 
-    def doubt_(self, ids: IntArray, memory: Any, reports: np.ndarray[Any, Any]) -> None:
-        """Trust lane changes no further than the road is known; see `reporting.doubt_`.
+    def judge_changes_(
+        self, ids: IntArray, reports: np.ndarray[Any, np.dtype[np.void]], t_ns: int
+    ) -> None:
+        """Say in the reports of all slots in use who changed lanes at a time [ns], in place; see
+        `estimation.changing`."""
+        tell_changes_(self._changes, ids, t_ns * 1e-9, self._p)
+        judge_changes_(self._p, reports, int((ids >= 0).sum()))
 
-        Without the ego's motion nothing is known of the road, and it is taken to be straight.
-        """
-        if math.isnan(self.speed):
-            return
-        doubtful = self._par[road.P_DOUBTFUL]
-        doubt_(self.x, self.P, doubtful, self.speed, self._h, ids, memory, reports)
+    def changing(self, slot: int, t: float) -> tuple[float, float]:
+        """How probable it is that the object in a slot was changing lanes at a time t [s], to the
+        left and to the right; NaN if nothing is known."""
+        return probabilities(self._changes[slot], t)
+
+    def last_seen(self, slot: int) -> float:
+        """When it was last seen whether the object in a slot changes lanes [s]."""
+        return float(self._changes["t"][slot])
 
     def globalise_(self, reports: np.ndarray[Any, np.dtype[np.void]], n: int) -> None:
         """The first n reports from the road's axes into the sensor's, in place."""

@@ -22,19 +22,19 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from can_imm.estimation.entry import entry_point
-from can_imm.estimation.road import N_ROAD, P_DOUBTFUL, P_SURE
+from can_imm.estimation.road import N_ROAD, P_SURE
 from can_imm.estimation.smoother import smooth_
 from can_imm.estimation.smoother_pairs import SMOOTHER_DTYPE
 from can_imm.hindsight import LOOK_AHEAD_S, Hindsight
 from can_imm.manoeuvres import ModeBank
 from can_imm.relations import MEMORY_DTYPE, hesitate_, relate_, shift_lanes_
-from can_imm.reporting import doubt_, globalise_
+from can_imm.reporting import globalise_, judge_changes_
 from can_imm.road import RoadFrame
 from can_imm.smoothing_rows import COASTING, FIRST, Reports, Rows, conclude_rows_, measurements
 from can_imm.types import REPORT_DTYPE, BoolArray, CanImmError, FloatArray, IntArray, Scan, Y
@@ -59,6 +59,7 @@ class _Track:
         rows: its rows without the first ``base`` ones, which are forgotten.
         told: the first of them of which nothing was said yet.
         last: number of the step of the last measurement, -1 before the first.
+        seen: time of the last measurement [s].
         said: number of rows that have been said.
         ended: nothing will be added.
         out: smoothed reports that wait to be said.
@@ -70,6 +71,7 @@ class _Track:
         self.base = 0
         self.told = 0
         self.last = -1
+        self.seen = math.nan
         self.said = 0
         self.ended = False
         self.out: Reports = np.zeros(0, REPORT_DTYPE)
@@ -77,17 +79,27 @@ class _Track:
 
 @dataclass
 class _Scan:
-    """A scan of which nothing has been said yet: its reports' tracks, their slots and their rows
-    counted from the tracks' first; state and covariance of the road."""
+    """A scan of which nothing has been said yet.
+
+    Attributes:
+        now, t: number of the step, and its time [s].
+        tracks, slots, rows: the reports' tracks, their slots and their rows counted from the
+            tracks' first.
+        moved: lanes that the ego moved to the left.
+        road: state of the road, None without one.
+        ego_speed: [m/s], NaN where unknown.
+        changes: (n, 2) for `reporting.judge_changes_`.
+    """
 
     now: int
+    t: float
     tracks: list[_Track]
     slots: list[int]
     rows: list[int]
-    road: FloatArray | None
-    road_cov: FloatArray
     moved: int
-    ego_speed: float
+    road: FloatArray | None = None
+    ego_speed: float = math.nan
+    changes: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 class _Smoother:
@@ -135,11 +147,11 @@ class _Smoother:
     ) -> None:
         """Write a scan down; see `detector.History`."""
         number = 0
-        noted = _Scan(now, [], np.flatnonzero(ids >= 0).tolist(), [], None, self._h, moved, np.nan)
+        noted = _Scan(now, scan.t_ns * 1e-9, [], np.flatnonzero(ids >= 0).tolist(), [], moved)
         if road is not None:
             # the filter's lane 0 is now another one
             self._shift += moved * road.width
-            noted.road, noted.road_cov = road.x.copy(), road.P.copy()
+            noted.road = road.x.copy()
             noted.ego_speed = road.speed
             if self._hindsight is not None:
                 number = self._hindsight.add(now, road, self._shift)
@@ -170,7 +182,7 @@ class _Smoother:
                 rows.steps[k] = COASTING
                 continue
             rows.steps[k] = now - track.last if track.last >= 0 else FIRST
-            track.last = now
+            track.last, track.seen = now, noted.t
             rows.x[k], rows.P[k] = x[place], P[place]
             rows.mu[k], rows.Pi[k] = mu[place], Pi[place]
             rows.z[k], rows.r[k] = z[self._row_of[place]], r[self._row_of[place]]
@@ -219,11 +231,7 @@ class _Smoother:
             self._ids[:] = -1
             self._ids[scan.slots] = reports["object_id"]
             if self._road is not None:
-                if not math.isnan(scan.ego_speed):
-                    doubt_(
-                        scan.road, scan.road_cov, self._road[P_DOUBTFUL], scan.ego_speed,
-                        self._h, self._ids, self._memory, reports,
-                    )  # fmt: skip
+                judge_changes_(scan.changes, reports, n)
                 hesitate_(self._ids, self._memory, self._road[P_SURE], reports, n)
             relate_(self._ids, self._memory, reports, n)
             globalise_(scan.road, self._h, reports, n, scan.ego_speed)
@@ -347,6 +355,26 @@ class FixedLagSmoother(_Smoother):
             raise CanImmError(f"the lag must be a step of the loop or longer, not {lag_s:g} s")
         super().__init__(bank)
         self._road = bank.road
+        self._frame: RoadFrame | None = None
+
+    def scan(
+        self,
+        now: int,
+        objects: Any,
+        ids: IntArray,
+        measured: BoolArray,
+        reports: Reports,
+        road: RoadFrame | None,
+        moved: int,
+        scan: Scan,
+        slot: IntArray,
+    ) -> None:
+        """Write a scan down; see `detector.History`."""
+        super().scan(now, objects, ids, measured, reports, road, moved, scan, slot)
+        self._frame = road
+        if road is not None:
+            noted = self._pending[-1]
+            noted.changes = np.array([road.changing(s, noted.t) for s in noted.slots])
 
     def end(self, slot: int) -> None:
         """The track in this slot ended; what is pending of it will still be said."""
@@ -354,6 +382,10 @@ class FixedLagSmoother(_Smoother):
         if track is None:
             return
         track.ended = True
+        # unless the slot has been given to another object
+        if self._frame is not None and self._frame.last_seen(slot) == track.seen:
+            for scan in self._pending:
+                self._look_back(scan, track)
         if track.said == track.base + track.rows.n:
             self._free.append(track.rows)
 
@@ -375,6 +407,8 @@ class FixedLagSmoother(_Smoother):
     def _say(self) -> tuple[int, Reports]:
         scan = self._pending.popleft()
         for place, (track, row) in enumerate(zip(scan.tracks, scan.rows, strict=True)):
+            if not track.ended:
+                self._look_back(scan, track)
             rows, k = track.rows, row - track.base
             self._go_back(rows, k, k + 1, self._out[place : place + 1])
             track.said = row + 1
@@ -388,3 +422,9 @@ class FixedLagSmoother(_Smoother):
                 track.base += done
         n = len(scan.tracks)
         return self._relate(scan, self._out[:n])
+
+    def _look_back(self, scan: _Scan, track: _Track) -> None:
+        """What is thought now of whether the track's vehicle was changing lanes in a scan."""
+        if self._frame is not None and track in scan.tracks:
+            k = scan.tracks.index(track)
+            scan.changes[k] = self._frame.changing(scan.slots[k], scan.t)

@@ -46,6 +46,9 @@ N_BEGUN = 8
 UNKNOWN = 1e6
 """A measurement with a larger variance is none."""
 
+Three = tuple[float, float, float]
+Four = tuple[float, float, float, float]
+
 COURSE_DTYPE = np.dtype(
     [
         ("first", np.int64),
@@ -76,18 +79,98 @@ the course [m, m/s]."""
 def course(u: float, steady: bool) -> tuple[float, float]:  # pragma: no cover - compiled
     """How much of the way is done at the share u of the time (0 or more), and its derivative by u.
 
-    At a constant rate, or between a quintic polynomial and half a cosine wave, which differ by 2 %
-    of the way.
+    At a constant rate, or between a quintic polynomial and a cubic, which differ by 4 % of the way;
+    half a cosine wave lies between them.
     """
     if u >= 1.0:
         return 1.0, 0.0
     if steady:
         return u, 1.0
-    quintic = u * u * u * (10.0 - 15.0 * u + 6.0 * u * u)
-    slope = 30.0 * u * u * (1.0 - u) * (1.0 - u)
-    cosine = 0.5 - 0.5 * math.cos(math.pi * u)
-    wave = 0.5 * math.pi * math.sin(math.pi * u)
-    return 0.5 * (quintic + cosine), 0.5 * (slope + wave)
+    u2, rest = u * u, 1.0 - u
+    quintic = u2 * u * (10.0 - 15.0 * u + 6.0 * u2)
+    cubic = u2 * (3.0 - 2.0 * u)
+    slope = 3.0 * u * rest * (5.0 * u * rest + 1.0)
+    return 0.5 * (quintic + cubic), slope
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def fading(hurry: float, dt: float) -> Four:  # pragma: no cover - compiled
+    """Transition matrix of place and rate beside a course, row by row, over ``dt`` [s]."""
+    fade = math.exp(-hurry * dt)
+    return (
+        (1.0 + hurry * dt) * fade,
+        dt * fade,
+        -hurry * hurry * dt * fade,
+        (1.0 - hurry * dt) * fade,
+    )
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def spread(P: Three, f: Four, hurry: float, beside: float) -> Three:  # pragma: no cover - compiled
+    """Covariance (P00, P01, P11) of place and rate beside a course after the transition f.
+
+    F (P - S) F' + S, S the stationary covariance.
+    """
+    s00, s11 = beside**2, (hurry * beside) ** 2
+    d00, d11 = P[0] - s00, P[2] - s11
+    g00, g01 = f[0] * d00 + f[1] * P[1], f[0] * P[1] + f[1] * d11
+    g10, g11 = f[2] * d00 + f[3] * P[1], f[2] * P[1] + f[3] * d11
+    return (
+        g00 * f[0] + g01 * f[1] + s00,
+        g00 * f[2] + g01 * f[3],
+        g10 * f[2] + g11 * f[3] + s11,
+    )
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def gains(
+    P: Three, r: float, rv: float
+) -> tuple[Three, Three, Three]:  # pragma: no cover - compiled
+    """Kalman gains of a measured place and then of a measured speed.
+
+    Args:
+        P: covariance before.  r, rv: variances, above `UNKNOWN` where not measured.
+
+    Returns:
+        The covariance after; variance of the place's innovation and its gains; the same of the
+        speed, with gains of 0 and a variance of 1 where not measured.
+    """
+    of_place, of_speed = (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)
+    if r < UNKNOWN:
+        v = P[0] + r
+        k0, k1 = P[0] / v, P[1] / v
+        of_place = v, k0, k1
+        P = P[0] - k0 * P[0], P[1] - k0 * P[1], P[2] - k1 * P[1]
+    if rv < UNKNOWN:
+        v = P[2] + rv
+        k0, k1 = P[1] / v, P[2] / v
+        of_speed = v, k0, k1
+        P = P[0] - k0 * P[1], P[1] - k0 * P[2], P[2] - k1 * P[2]
+    return P, of_place, of_speed
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def correct(
+    place: float, rate: float, e: float, ev: float, of_place: Three, of_speed: Three, outlier: float
+) -> Three:  # pragma: no cover - compiled
+    """Place and rate beside a course after a measurement, and minus twice its log likelihood.
+
+    Args:
+        e, ev: place and speed measured, minus the course's.  of_place, of_speed: as of `gains`.
+        outlier: the squared normalised error counts as this at most.
+    """
+    e -= place
+    place += of_place[1] * e
+    rate += of_place[2] * e
+    ev -= rate
+    lost = 0.0
+    if of_place[1] > 0.0:
+        lost += min(e * e / of_place[0], outlier)
+    if of_speed[2] > 0.0:
+        lost += min(ev * ev / of_speed[0], outlier)
+        place += of_speed[1] * ev
+        rate += of_speed[2] * ev
+    return place, rate, lost
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -168,8 +251,8 @@ def find_lane_changes_(
     courses = np.zeros(4096, COURSE_DTYPE)
     active = np.zeros(4096, np.int64)
     count = n_active = 0
-    P00, P01, P11 = beside[0] ** 2, 0.0, (HURRY * beside[0]) ** 2
-    f00, f01, f10, f11 = 1.0, 0.0, 0.0, 1.0
+    P = beside[0] ** 2, 0.0, (HURRY * beside[0]) ** 2
+    f = 1.0, 0.0, 0.0, 1.0
     best = 0.0
     for k in range(n):
         # what may begin
@@ -206,29 +289,17 @@ def find_lane_changes_(
                         count += 1
         # on to this row
         if k > 0:
-            fade = math.exp(-HURRY * dt)
-            f00, f01 = (1.0 + HURRY * dt) * fade, dt * fade
-            f10, f11 = -HURRY * HURRY * dt * fade, (1.0 - HURRY * dt) * fade
-            # F (P - S) F' + S, S the stationary covariance
-            s00, s11 = beside[k] ** 2, (HURRY * beside[k]) ** 2
-            d00, d11 = P00 - s00, P11 - s11
-            g00, g01 = f00 * d00 + f01 * P01, f00 * P01 + f01 * d11
-            g10, g11 = f10 * d00 + f11 * P01, f10 * P01 + f11 * d11
-            P00, P01, P11 = (
-                g00 * f00 + g01 * f01 + s00,
-                g00 * f10 + g01 * f11,
-                g10 * f10 + g11 * f11,
-            )
-            P11 += s11
+            f = fading(HURRY, dt)
+            P = spread(P, f, HURRY, beside[k])
             for lane in range(N_LANES):
                 alpha[k, lane] = alpha[k - 1, lane] + math.log1p(-min(RATE * dt, 0.5))
                 a, b = place[lane], rate[lane]
-                place[lane], rate[lane] = f00 * a + f01 * b, f10 * a + f11 * b
+                place[lane], rate[lane] = f[0] * a + f[1] * b, f[2] * a + f[3] * b
         kept = 0
         for q in range(n_active):
             c = courses[active[q]]
             a, b = c.place, c.rate
-            c.place, c.rate = f00 * a + f01 * b, f10 * a + f11 * b
+            c.place, c.rate = f[0] * a + f[1] * b, f[2] * a + f[3] * b
             since = t[k] - c.start - c.duration
             if since >= 0.0 and c.end == n:
                 c.end = k
@@ -246,48 +317,26 @@ def find_lane_changes_(
             alpha[k, to] = total
         n_active = kept
         # the measurement
-        var_y, k0, k1 = 1.0, 0.0, 0.0
-        if r[k] < UNKNOWN:
-            var_y = P00 + r[k]
-            k0, k1 = P00 / var_y, P01 / var_y
-        P00, P01, P11 = P00 - k0 * P00, P01 - k0 * P01, P11 - k1 * P01
-        var_v, h0, h1 = 1.0, 0.0, 0.0
-        if rv[k] < UNKNOWN:
-            var_v = P11 + rv[k]
-            h0, h1 = P01 / var_v, P11 / var_v
-        P00, P01, P11 = P00 - h0 * P01, P01 - h0 * P11, P11 - h1 * P11
-        scale = -0.5 * (math.log(var_y) + math.log(var_v))
+        P, of_place, of_speed = gains(P, r[k], rv[k])
+        scale = -0.5 * (math.log(of_place[0]) + math.log(of_speed[0]))
         best = -np.inf
         for lane in range(N_LANES):
-            log_l = scale
-            if r[k] < UNKNOWN:
-                e = y[k] - (lane - EDGE) * width - place[lane]
-                log_l -= 0.5 * min(e * e / var_y, OUTLIER)
-                place[lane] += k0 * e
-                rate[lane] += k1 * e
-            if rv[k] < UNKNOWN:
-                e = vy[k] - rate[lane]
-                log_l -= 0.5 * min(e * e / var_v, OUTLIER)
-                place[lane] += h0 * e
-                rate[lane] += h1 * e
-            like[k, lane] = log_l
-            alpha[k, lane] += log_l
+            off = y[k] - (lane - EDGE) * width
+            place[lane], rate[lane], lost = correct(
+                place[lane], rate[lane], off, vy[k], of_place, of_speed, OUTLIER
+            )
+            like[k, lane] = scale - 0.5 * lost
+            alpha[k, lane] += like[k, lane]
             best = max(best, alpha[k, lane])
         for q in range(n_active):
             c = courses[active[q]]
             done, slope = course((t[k] - c.start) / c.duration, c.steady)
-            log_l = scale
-            if r[k] < UNKNOWN:
-                e = y[k] - (c.lane - EDGE + c.turn * done) * width - c.place
-                log_l -= 0.5 * min(e * e / var_y, OUTLIER)
-                c.place += k0 * e
-                c.rate += k1 * e
-            if rv[k] < UNKNOWN:
-                e = vy[k] - c.turn * slope * width / c.duration - c.rate
-                log_l -= 0.5 * min(e * e / var_v, OUTLIER)
-                c.place += h0 * e
-                c.rate += h1 * e
-            c.log_like += log_l
+            off = y[k] - (c.lane - EDGE + c.turn * done) * width
+            speed = vy[k] - c.turn * slope * width / c.duration
+            c.place, c.rate, lost = correct(
+                c.place, c.rate, off, speed, of_place, of_speed, OUTLIER
+            )
+            c.log_like += scale - 0.5 * lost
             best = max(best, c.log_before + c.log_prior + c.log_like)
         kept = 0
         for q in range(n_active):

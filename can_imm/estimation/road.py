@@ -69,8 +69,15 @@ PARAMETERS = (
     "error_most",
     "speed_error_weight",
     "speed_error_most",
-    "doubtful",
     "hindsight",
+    "beside_std",
+    "beside_spread",
+    "beside_rate",
+    "beside_error",
+    "beside_speed_error",
+    "change_rate",
+    "change_steady",
+    "settle",
     "sure",
 )
 """Names of the parameters, in their order in the array.
@@ -83,15 +90,21 @@ the offset; ``wander_std`` [m] and ``wander_time`` [s] of a vehicle in its lane;
 of its place, and while it changes lanes; ``*_weight``: by how much more the variances of this
 estimate count than those of white noise, since its errors last; ``*_most`` [m, m/s]: no larger
 error is added to the measurements' noise: however little is known of where the lanes are far ahead,
-that a vehicle moves across them is seen; ``doubtful`` [m/s]: see `reporting.doubt_`; ``hindsight``
-[s]: see `estimation.guides`; ``sure``: see `relations.hesitate_`.
+that a vehicle moves across them is seen; ``hindsight`` [s]: see `estimation.guides`; and for
+`estimation.changing`: ``beside_std`` [m] of a vehicle's place beside the middle of its lane or its
+course into another, ``beside_spread`` of its logarithm among vehicles, ``beside_rate`` [1/s]: how
+fast such a place is forgotten, ``*_error``: by how much more the variances of this
+estimate count; ``change_rate`` [1/s] of lane changes, ``change_steady``: share of them at a
+constant rate, ``settle`` [s]: so long after it a lane change may still turn out to be none;
+``sure``: see `relations.hesitate_`.
 """
 (
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,
     P_TURN_STD, P_TURN_TIME, P_CURVATURE_STD, P_CURVATURE_LENGTH, P_BIAS_STD, P_MOUNTING_STD,
     P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_WANDER_STD, P_WANDER_TIME, P_FREEDOM,
     P_FREEDOM_CHANGING, P_ERROR_WEIGHT, P_ERROR_MOST, P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST,
-    P_DOUBTFUL, P_HINDSIGHT, P_SURE,
+    P_HINDSIGHT, P_BESIDE_STD, P_BESIDE_SPREAD, P_BESIDE_RATE, P_BESIDE_ERROR, P_BESIDE_SPEED_ERROR,
+    P_CHANGE_RATE, P_CHANGE_STEADY, P_SETTLE, P_SURE,
 ) = range(len(PARAMETERS))  # fmt: skip
 
 USUAL_SPEED = 25.0
