@@ -25,6 +25,11 @@ STEADY = 0.6
 """Up to this relative speed [m/s] an object is about as fast as the ego."""
 
 
+RAMP_ODDS, RAMP_SPEED, RAMP_RATE, RAMP_MOST = -8.15, 7.4, 17.0, 0.5
+"""Log odds that a vehicle said to keep its lane has begun to approach or recede because the ego
+speeds up or slows down: bias, factors of the speed [s/m] and of the ego's acceleration [s²/m],
+which counts up to the last value [m/s²].  Fitted on simulated traffic (settings "tuning")."""
+
 LEAST = 1e-4
 """Where less is left for all that is no lane change, the speed tells what it would be."""
 
@@ -216,3 +221,28 @@ def judge_changes_(p: FloatArray, reports: Any, n: int) -> None:
         report.direction = 0
         if decide_(report) == _LANE_CHANGE:
             report.direction = 1 if p[k, 0] > p[k, 1] else -1
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def judge_ramps_(acceleration: float, reports: Any, n: int) -> None:
+    """Say in the first n reports who approaches or recedes for the ego changes its speed, in place.
+
+    Whoever keeps their speed meanwhile does so from the first moment on, when their speed against
+    the ego's does not show it yet.
+
+    Args:
+        acceleration: of the ego [m/s²], NaN where unknown.
+    """
+    if not abs(acceleration) > 0.0:
+        return
+    way = -1.0 if acceleration > 0.0 else 1.0
+    to = _RECEDING if acceleration < 0.0 else _APPROACHING
+    for k in range(n):
+        report = reports[k]
+        odds = RAMP_ODDS + RAMP_SPEED * way * report.x[1]
+        odds += RAMP_RATE * min(abs(acceleration), RAMP_MOST)
+        share = report.p[_KEEP_LANE] / (1.0 + math.exp(-odds))
+        report.p[_KEEP_LANE] -= share
+        report.p[to] += share
+        if decide_(report) != _LANE_CHANGE:
+            report.direction = 0

@@ -16,7 +16,7 @@ from can_imm.estimation.changing import (
     shift_changes_,
     tell_changes_,
 )
-from can_imm.reporting import globalise_, judge_changes_
+from can_imm.reporting import globalise_, judge_changes_, judge_ramps_
 from can_imm.types import VY, FloatArray, IntArray, Scan
 
 if TYPE_CHECKING:
@@ -27,6 +27,11 @@ SCANS = 64
 
 SHORTEST_S = 0.001
 """[s]; the first scan after a silence has no time before it."""
+
+SPEED_STD, RATE_STD = 0.06, 0.3
+"""Of the ego's speed on the bus [m/s], and of its acceleration before it is known [m/s²]."""
+JERK = 0.3
+"""How fast the acceleration changes: spectral density of its noise [m²/s⁵]."""
 
 LONGEST_S = 1.0
 """After a longer silence [s] the ego has moved on unseen: the road is a new one."""
@@ -44,7 +49,8 @@ class RoadFrame:
     Attributes:
         x, P: (N_ROAD,), (N_ROAD, N_ROAD) state and covariance of the filter at the last scan,
             without the guides.
-        speed, yaw_rate: of the ego at the last scan [m/s, rad/s], NaN where unknown.
+        speed, yaw_rate, acceleration: of the ego at the last scan [m/s, rad/s, m/s²], NaN where
+            unknown.
     """
 
     def __init__(self, par: FloatArray) -> None:
@@ -62,6 +68,8 @@ class RoadFrame:
         self._t_ns = -1
         self.speed = math.nan
         self.yaw_rate = math.nan
+        self.acceleration = math.nan
+        self._pace, self._pace_cov = np.zeros(2), np.zeros((2, 2))
         self._h = np.zeros(road.N_ROAD + 1)
 
     @property
@@ -115,9 +123,24 @@ class RoadFrame:
         self.x, self.P = self._past[: road.N_ROAD].copy(), self._without_guides()
         for passed in self._motion:
             self._pass(self.x, self.P, *passed)
+        self._follow_speed((t_ns - self._t_ns) * 1e-9, speed)
         self._t_ns = t_ns
         self.speed = speed
         self.yaw_rate = yaw_rate
+
+    def _follow_speed(self, dt: float, speed: float) -> None:
+        """A Kalman filter of the ego's speed and acceleration."""
+        if math.isnan(speed) or not 0.0 < dt <= LONGEST_S or math.isnan(self.acceleration):
+            self._pace, self._pace_cov = np.array([speed, 0.0]), np.diag([SPEED_STD, RATE_STD]) ** 2
+            self.acceleration = 0.0 if speed == speed else math.nan
+            return
+        F = np.array([[1.0, dt], [0.0, 1.0]])
+        P = F @ self._pace_cov @ F.T
+        P += JERK * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
+        x = F @ self._pace
+        gain = P[:, 0] / (P[0, 0] + SPEED_STD**2)
+        self._pace, self._pace_cov = x + gain * (speed - x[0]), P - np.outer(gain, P[0])
+        self.acceleration = float(self._pace[1])
 
     def _pass(self, x: FloatArray, P: FloatArray, dt: float, speed: float, yaw_rate: float) -> None:
         if dt > 0.0:
@@ -195,8 +218,10 @@ class RoadFrame:
     ) -> None:
         """Say in the reports of all slots in use who changed lanes at a time [ns], in place; see
         `estimation.changing`."""
+        n = int((ids >= 0).sum())
         tell_changes_(self._changes, ids, t_ns * 1e-9, self._p)
-        judge_changes_(self._p, reports, int((ids >= 0).sum()))
+        judge_changes_(self._p, reports, n)
+        judge_ramps_(self.acceleration, reports, n)
 
     def changing(self, slot: int, t: float) -> tuple[float, float]:
         """How probable it is that the object in a slot was changing lanes at a time t [s], to the

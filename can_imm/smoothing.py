@@ -34,7 +34,7 @@ from can_imm.estimation.smoother_pairs import SMOOTHER_DTYPE
 from can_imm.hindsight import LOOK_AHEAD_S, Hindsight
 from can_imm.manoeuvres import ModeBank
 from can_imm.relations import MEMORY_DTYPE, hesitate_, relate_, shift_lanes_
-from can_imm.reporting import globalise_, judge_changes_
+from can_imm.reporting import globalise_, judge_changes_, judge_ramps_
 from can_imm.road import RoadFrame
 from can_imm.smoothing_rows import COASTING, FIRST, Reports, Rows, conclude_rows_, measurements
 from can_imm.types import REPORT_DTYPE, BoolArray, CanImmError, FloatArray, IntArray, Scan, Y
@@ -87,7 +87,7 @@ class _Scan:
             tracks' first.
         moved: lanes that the ego moved to the left.
         road: state of the road, None without one.
-        ego_speed: [m/s], NaN where unknown.
+        ego_speed, acceleration: of the ego [m/s, m/s²], NaN where unknown.
         changes: (n, 2) for `reporting.judge_changes_`.
     """
 
@@ -99,6 +99,7 @@ class _Scan:
     moved: int
     road: FloatArray | None = None
     ego_speed: float = math.nan
+    acceleration: float = math.nan
     changes: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
@@ -152,7 +153,7 @@ class _Smoother:
             # the filter's lane 0 is now another one
             self._shift += moved * road.width
             noted.road = road.x.copy()
-            noted.ego_speed = road.speed
+            noted.ego_speed, noted.acceleration = road.speed, road.acceleration
             if self._hindsight is not None:
                 number = self._hindsight.add(now, road, self._shift)
         self._grow_slots(len(ids))
@@ -232,6 +233,7 @@ class _Smoother:
             self._ids[scan.slots] = reports["object_id"]
             if self._road is not None:
                 judge_changes_(scan.changes, reports, n)
+                judge_ramps_(scan.acceleration, reports, n)
                 hesitate_(self._ids, self._memory, self._road[P_SURE], reports, n)
             relate_(self._ids, self._memory, reports, n)
             globalise_(scan.road, self._h, reports, n, scan.ego_speed)

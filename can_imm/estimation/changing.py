@@ -57,14 +57,14 @@ APART = 0.12
 """Courses begin so long one after the other [s]."""
 IMPOSSIBLE = 12.0
 """A course whose log weight is so much lower than that of the best one is given up."""
-OUTLIER = 30.0
+OUTLIER = 39.0
 """Squared normalised error of a measurement counts as this at most."""
 LEVELS = np.array([0.1, 0.16, 0.25, 0.4, 0.6])
 """Standard deviations of places beside the middle of a lane that are told apart [m]."""
 N_LEVELS = len(LEVELS)
-MEMORY_S = 15.0
+MEMORY_S = 35.0
 """So long it counts how a vehicle has wandered [s]."""
-CALM = 0.1
+CALM = 0.16
 """A vehicle that is less likely to change lanes shows how it wanders."""
 SURPRISE = 9.0
 """Squared normalised error of a measurement counts as this at most for how a vehicle wanders."""
