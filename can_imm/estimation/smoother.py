@@ -185,7 +185,7 @@ def pass_(
 ) -> None:  # pragma: no cover - compiled
     """`smooth_` with the number of states as a constant."""
     n_modes = bank.n_modes
-    at = 0
+    at: Any = np.int64(0)  # a plain 0 is a type of its own, for which kernels would be compiled
     later = -1
     for b in range(last - first):
         k = last - 1 - b
