@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 from pathlib import Path
 
 from hypothesis import settings
 
 import can_imm
+
+# Before numpy is imported: matrices are small here, a second thread gains nothing with them, and
+# where something else wants its core, the first one waits for it.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # A shell starts its background jobs with SIGINT ignored, and programs that the tests start would
 # inherit that; a handler they do not.
