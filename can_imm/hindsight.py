@@ -129,25 +129,26 @@ class Hindsight:
         way = self._road(begin, ego, ego_speed.mean(axis=1))
         place, beside = way.place(scan, z, r)
         t, width = ego["t"][scan], float(ego["x"][-1, WIDTH])
-        p = np.zeros((len(measured), 4))
+        speeds, changes = np.zeros((2, len(measured), 2))
         # along the road
         along, rate = np.zeros((2, len(measured), N_PATHS))
         seen = np.where(r < np.inf, place, np.nan)
         draw_speeds_(
             t, seen[:, X].copy(), seen[:, VX].copy(), r[:, :2].copy(), self._noise, along, rate
         )
-        judge_speeds_(along - ego_speed[scan], rate - ego_rate[scan], p[:, 2:])
+        judge_speeds_(along - ego_speed[scan], rate - ego_rate[scan], speeds)
         # across it
         lane = width * round(float(np.nanmedian(seen[:, Y])) / width)
         find_lane_changes_(
             t, place[:, Y] - lane, r[:, Y].copy(), place[:, VY].copy(), r[:, VY].copy(), beside,
-            width, p[:, :2],
+            width, changes,
         )  # fmt: skip
         # the track was smoothed on the road as it was known then
         then = RoadAtTheTime(ego, ego_speed.mean(axis=1)).lane(scan, z[:, X])
         correction = place[:, Y] - ego["shift"][scan] - (z[:, Y] - then)
         now, known = rows.now[first:last], rows.now[measured]
-        p = np.stack([np.interp(now, known, column) for column in p.T], axis=1)
+        columns = (*changes.T, *speeds.T)
+        p = np.stack([np.interp(now, known, column) for column in columns], axis=1)
         lateral = reports["x"][:, Y] + np.interp(now, known, correction)
         label_(self._bank, width, p, lateral, reports)
 

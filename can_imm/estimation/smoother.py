@@ -34,7 +34,8 @@ def forget_pair_(n: int, i: int, P: FloatArray, work: Any) -> None:  # pragma: n
             work.sP[i, s, t] = P[s, t]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+# As in `imm`, kernels that are part of one other only are put in before anything is compiled.
+@numba.njit(inline="always", error_model="numpy")
 def back_(
     n: int,
     bank: Any,
@@ -165,7 +166,7 @@ def combine_smoothed_(
             cov[t, s] = v
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+@numba.njit(inline="always", error_model="numpy")
 def pass_(
     n: int,
     bank: Any,
@@ -184,7 +185,7 @@ def pass_(
 ) -> None:  # pragma: no cover - compiled
     """`smooth_` with the number of states as a constant."""
     n_modes = bank.n_modes
-    at = 0
+    at: Any = np.int64(0)  # a plain 0 is a type of its own, for which kernels would be compiled
     later = -1
     for b in range(last - first):
         k = last - 1 - b
@@ -235,10 +236,10 @@ def smooth_(
             modes are true, and so is the result; 0: only the transitions count (Kim 1994).
         mean, cov, p: (K, n), (K, n, n), (K, M), written: combined estimate, mode probabilities.
     """
-    rest = (first, last, x, P, mu, Pi, steps, trust, mean, cov, p, work[0])
+    # Named one by one: the number of states would be no constant beside a starred tuple.
     if bank[0].n_states == 4:
-        pass_(4, bank[0], *rest)
+        pass_(4, bank[0], first, last, x, P, mu, Pi, steps, trust, mean, cov, p, work[0])
     elif bank[0].n_states == 5:
-        pass_(5, bank[0], *rest)
+        pass_(5, bank[0], first, last, x, P, mu, Pi, steps, trust, mean, cov, p, work[0])
     else:
-        pass_(bank[0].n_states, bank[0], *rest)
+        pass_(6, bank[0], first, last, x, P, mu, Pi, steps, trust, mean, cov, p, work[0])

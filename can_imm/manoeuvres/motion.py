@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -46,6 +47,7 @@ def _constant_velocity(table: Table, n: int, dt: float) -> Matrices:
 def _equation_33(table: Table, n: int, dt: float) -> Matrices:
     """Constant velocity with Q as printed in the paper's equation (33), per prediction step."""
     F, Q = _discrete_cv(table, 1.0, n, dt)
+    Q = Q.copy()
     Q[:2, :2] = np.diag([dt**2 / 2.0, dt])
     return F, Q
 
@@ -68,7 +70,7 @@ def _discrete_cv(table: Table, q: float, n: int, dt: float, damping: float = 0.0
         sigma = table.number("acceleration_std", 1.0, low=0.0)
         A[2, 2] = -50.0
         W[2, 2] = 100.0 * sigma**2
-    return discretise(A, W, dt)
+    return _discretised(A.tobytes(), W.tobytes(), n, dt)
 
 
 def _singer(table: Table, n: int, dt: float) -> Matrices:
@@ -83,7 +85,16 @@ def _singer(table: Table, n: int, dt: float) -> Matrices:
     A[2, 2] = -1.0 / tau
     W[2, 2] = 2.0 * sigma**2 / tau
     W[1, 1] = table.number("q", 0.0, low=0.0)
-    return discretise(A, W, dt)
+    return _discretised(A.tobytes(), W.tobytes(), n, dt)
+
+
+@lru_cache(maxsize=256)
+def _discretised(A: bytes, W: bytes, n: int, dt: float) -> Matrices:
+    """`discretise`, which takes most of the time of loading a bank: its modes have a lot in common.
+
+    The matrices by their bytes; the result is everybody's and must not be changed.
+    """
+    return discretise(np.frombuffer(A).reshape(n, n), np.frombuffer(W).reshape(n, n), dt)
 
 
 _MODELS: dict[str, Callable[[Table, int, float], Matrices]] = {

@@ -85,7 +85,7 @@ def test_scans_are_told_apart_by_one_bit():
     assert (decoder.counts.scans, decoder.counts.stray) == (20, 0)
 
 
-@settings(max_examples=50)
+@settings(max_examples=15)
 @given(
     distance=st.integers(10, 2000), angle=st.integers(-450, 450), x=st.floats(-5, 5),
     y=st.floats(-2, 2), yaw=st.floats(-170, 170),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import threading
 import time
+from dataclasses import replace
 
 import can
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from can_imm.bus.decoder import ScanDecoder
 from can_imm.bus.profile import load_profile
 from can_imm.bus.sources import LogSource
+from can_imm.sim.motorway import TUNING, VARIANTS
 from can_imm.types import Manoeuvre
 
 
@@ -84,7 +86,8 @@ def test_losses(can_imm, scenario, tmp_path):
 
 
 @pytest.mark.parametrize("profile", ["can_imm", "ars408", "toyota", "toyota-tss2", "esr"])
-def test_motorway(can_imm, tmp_path, profile):
+def test_motorway(can_imm, tmp_path, monkeypatch, profile):
+    monkeypatch.setitem(VARIANTS, "tuning", replace(TUNING, duration=30.0))
     log, truth = tmp_path / "drive.log", tmp_path / "truth.csv"
     status, out, err = can_imm(
         "simulate", "--scenario", "motorway", "--seed", 4, "--profile", profile, "--log", log,
@@ -121,7 +124,7 @@ def test_motorway(can_imm, tmp_path, profile):
             away = np.hypot(x[:, None] - there[:, 0], y[:, None] - there[:, 1])
             errors += (away.min(axis=1) / np.maximum(np.hypot(x, y), 50.0)).tolist()
     period = {"can_imm": 100, "ars408": 1000 / 14}.get(profile, 50)
-    assert len(times) > 0.97 * 60_000 / period
+    assert len(times) > 0.97 * 30_000 / period
     assert len(errors) > 4 * len(times)
     assert np.mean(errors) < 0.01
     assert np.quantile(errors, 0.999) < 0.05

@@ -8,7 +8,8 @@ import numpy as np
 from oracles.gaussian import random_covariance
 from oracles.imm import Imm, Mode
 
-from can_imm.estimation import imm, layout
+from can_imm.estimation import layout
+from can_imm.estimation.entry import Processor
 from can_imm.estimation.noise import noise_state
 from can_imm.estimation.particles import N_COLUMNS, N_SCRATCH
 
@@ -68,7 +69,7 @@ def add_bound(
 
 
 class Runner:
-    """`process_scan_` with its buffers, for tests that go object by object or all at once."""
+    """`Processor` with its buffers, for tests that go object by object or all at once."""
 
     def __init__(
         self, bank: np.ndarray[Any, Any], capacity: int, n_particles: int = 0, seed: int = 0
@@ -98,13 +99,15 @@ class Runner:
         n = len(slots)
         z = np.array(z, float).reshape(n, 4)
         status = np.full(n, 77, np.int8)
-        imm.process_scan_(
-            self.bank, self.objects, self.work, n, np.array(slots, np.int32),
-            np.array(steps, np.int32), z, np.broadcast_to(r, z.shape).copy(),
-            np.ones(z.shape, np.bool_) if valid is None else np.array(valid).reshape(n, 4),
-            np.full(n, angle), ground, lane_width, age, gate,
-            self.particles, self.spare, self.weights, self.noise, status,
+        valid = np.ones(z.shape, np.bool_) if valid is None else np.array(valid).reshape(n, 4)
+        processor = Processor(
+            gate, bank=self.bank, objects=self.objects, work=self.work,
+            slot=np.array(slots, np.int32), steps=np.array(steps, np.int32), z=z,
+            r=np.broadcast_to(np.asarray(r, float), z.shape).copy(), valid=valid,
+            angle=np.full(n, float(angle)), particles=self.particles, spare=self.spare,
+            weights=self.weights, noise=self.noise, status=status,
         )  # fmt: skip
+        processor.run(processor.address, n, float(ground), float(lane_width), float(age))
         return status
 
 

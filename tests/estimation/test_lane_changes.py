@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -87,12 +88,18 @@ def found(
     return p
 
 
+@cache
+def beside(t: bytes) -> FloatArray:
+    """Root of the `covariance` at times t (K,)."""
+    both = covariance(np.frombuffer(t))
+    return np.linalg.cholesky(both + 1e-9 * np.eye(len(both)))
+
+
 def drive(
     rng: np.random.Generator, t: FloatArray, lane: int, side: int, start: float, duration: float
 ) -> tuple[FloatArray, FloatArray]:
     """Measured places and speeds of a vehicle that changes lanes once (side 0: not at all)."""
-    beside = np.linalg.cholesky(covariance(t) + 1e-9 * np.eye(2 * len(t)))
-    wander = (beside @ rng.standard_normal(2 * len(t))).reshape(2, -1)
+    wander = (beside(t.tobytes()) @ rng.standard_normal(2 * len(t))).reshape(2, -1)
     u = (t - start) / duration
     slope = (way(u + 1e-6) - way(u - 1e-6)) / (2e-6 * duration)
     y = WIDTH * (lane + side * way(u)) + wander[0] + 0.2 * rng.standard_normal(len(t))
