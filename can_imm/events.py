@@ -40,9 +40,11 @@ _PASSING = (int(Manoeuvre.OVERTAKING), 0)
 
 @dataclass(frozen=True)
 class Event:
-    """A stretch in which an object does something; times of its first and last report [ns].
+    """A stretch in which an object does something.
 
     Attributes:
+        from_ns, to_ns: times of its first and last report [ns]; of a lane change when it began and
+            ended by what was known of it at last, if that was told.
         manoeuvre: value of `Manoeuvre`.  OVERTAKING may last across other events: where it is a
             flag on top of the manoeuvres it lasts as long as the flag.
         event: CUT_IN or CUT_OUT of a lane change, unless it was seen to come to nothing; OVERTAKING
@@ -76,7 +78,8 @@ class Event:
 
 
 class _Row(NamedTuple):
-    """What of a report counts here; the fields of its dtype by name, then gap and speed."""
+    """What of a report counts here; the fields of its dtype by name, then gap, speed, and when a lane
+    change began and ends [s]."""
 
     object_id: int
     t_ns: int
@@ -91,6 +94,8 @@ class _Row(NamedTuple):
     ego_speed: float
     x: float
     vx: float
+    begin: float
+    end: float
 
 
 @dataclass(slots=True)
@@ -111,11 +116,14 @@ class _Stretch:
     probability: float = 0.0
     cut_in: int = 0
     cut_out: int = 0
+    begin: float = math.nan
+    end: float = math.nan
 
 
 @dataclass(slots=True)
 class _Track:
     object_id: int
+    first_ns: int
     t_ns: int
     age: int
     open: dict[tuple[int, int], _Stretch] = field(default_factory=dict)
@@ -161,8 +169,8 @@ class EventCollector:
             # no reports at all may mean that the scan was not used
             if ids or t_ns - self._tracks[gone].t_ns > GAP_NS:
                 self._end(gone)
-        columns = [reports[name].tolist() for name in _Row._fields[:-2]]
-        columns += reports["x"][:, [X, VX]].T.tolist()
+        columns = [reports[name].tolist() for name in _Row._fields[:-4]]
+        columns += reports["x"][:, [X, VX]].T.tolist() + reports["change"].T.tolist()
         for row in map(_Row._make, zip(*columns, strict=True)):
             self._take(row)
 
@@ -173,10 +181,10 @@ class EventCollector:
             self._end(row.object_id)
             track = None
         if track is None:
-            track = self._tracks[row.object_id] = _Track(row.object_id, row.t_ns, row.age)
+            track = self._tracks[row.object_id] = _Track(row.object_id, row.t_ns, row.t_ns, row.age)
         before_ns, track.t_ns = track.t_ns, row.t_ns
         track.age, track.duplicate_of = row.age, row.duplicate_of
-        self._remember(track, row.lane)
+        self._remember(track, row)
         self._close_old(track)
         if row.duplicate_of >= 0:
             self._yield_to(row.duplicate_of, track)
@@ -197,15 +205,17 @@ class EventCollector:
             self._end(object_id)
 
     @staticmethod
-    def _remember(track: _Track, lane: int) -> None:
+    def _remember(track: _Track, row: _Row) -> None:
         """Keep the lanes of the last `GAP_NS`, and the one before those."""
-        track.lanes.append((track.t_ns, lane))
+        track.lanes.append((track.t_ns, row.lane))
         while len(track.lanes) > 1 and track.lanes[1][0] <= track.t_ns - GAP_NS:
             track.lanes.popleft()
         for (manoeuvre, _), stretch in track.open.items():
             # A border may be crossed a little after a lane change is said to be over.
             if manoeuvre in _ACROSS and track.t_ns - stretch.last_ns <= GAP_NS:
-                stretch.lane_to = lane
+                stretch.lane_to = row.lane
+                if row.begin == row.begin:
+                    stretch.begin, stretch.end = row.begin, row.end
 
     @staticmethod
     def _extend(track: _Track, key: tuple[int, int], before_ns: int, row: _Row) -> None:
@@ -221,6 +231,8 @@ class EventCollector:
                 gap=row.x,
                 speed=row.vx,
                 abs_speed=row.ego_speed + row.vx,
+                begin=row.begin,
+                end=row.end,
             )
         elif stretch.last_ns == before_ns:
             stretch.held_ns += row.t_ns - before_ns
@@ -255,14 +267,18 @@ class EventCollector:
             seen and s.lane_from == s.lane_to
         ):
             event = "CUT_IN" if s.cut_in >= s.cut_out else "CUT_OUT"
+        first_ns, last_ns = s.first_ns, s.last_ns
+        if manoeuvre == Manoeuvre.LANE_CHANGE and s.begin == s.begin:
+            first_ns = max(round(s.begin * 1e9), track.first_ns)
+            last_ns = max(min(round(s.end * 1e9), track.t_ns), first_ns)
         self._found.append(
             Event(
                 s.object_id,
                 manoeuvre,
                 event,
                 key[1],
-                s.first_ns,
-                s.last_ns,
+                first_ns,
+                last_ns,
                 s.probability / s.n,
                 s.lane_from,
                 s.lane_to,

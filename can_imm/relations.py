@@ -14,6 +14,7 @@ NO_LANE = -128
 MEMORY_DTYPE = np.dtype(
     [
         ("left_ns", np.int64),
+        ("trust", np.float64),
         ("twin", np.int32),
         ("twin_scans", np.int32),
         ("kept", np.int16),
@@ -22,9 +23,10 @@ MEMORY_DTYPE = np.dtype(
     ],
     align=True,
 )
-"""What is remembered of a slot: ``changing`` a lane change was said of it; ``kept`` the lane that
-it kept last, ``left`` the one that it left to the left at ``left_ns`` (lanes by number, `NO_LANE`
-for none); ``twin`` slot of an object that is in the same place since ``twin_scans`` scans."""
+"""What is remembered of a slot: ``changing`` a lane change was said of it, ``trust`` how far it was
+trusted (`reporting.doubt_`); ``kept`` the lane it kept last, ``left`` the lane that it left to the
+left at ``left_ns`` (lanes by number, `NO_LANE` for none); ``twin`` slot of an object that has been
+in the same place for ``twin_scans`` scans."""
 
 OVERTAKING_NS = 20_000_000_000
 """So long after a lane change to the left [ns] passing the other lane's vehicles is overtaking."""

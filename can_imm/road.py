@@ -12,11 +12,11 @@ from can_imm.estimation import guides, road
 from can_imm.estimation.changing import (
     CHANGES_DTYPE,
     follow_all_,
-    probabilities,
+    look,
     shift_changes_,
     tell_changes_,
 )
-from can_imm.reporting import globalise_, judge_changes_, judge_ramps_
+from can_imm.reporting import doubt_, globalise_, judge_changes_, judge_ramps_
 from can_imm.types import VY, FloatArray, IntArray, Scan
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class RoadFrame:
         self._guide_unseen = np.zeros(road.N_GUIDES)
         self._notes: np.ndarray[Any, np.dtype[np.void]] = np.zeros((SCANS, 0), guides.NOTE_DTYPE)
         self._changes: np.ndarray[Any, np.dtype[np.void]] = np.zeros(0, CHANGES_DTYPE)
-        self._p: FloatArray = np.zeros((0, 2))
+        self._p: FloatArray = np.zeros((0, 4))
         # the filter as of the last scan that was learnt from; the ego's motion of those since
         self._past, self._P_past = road.new_road(par)
         self._motion: deque[tuple[float, float, float]] = deque()
@@ -87,7 +87,7 @@ class RoadFrame:
 
     def warm_up(
         self, bank: ModeBank, objects: Any, slot: Any, status: Any, age: Any,
-        ids: IntArray, reports: np.ndarray[Any, Any],
+        ids: IntArray, memory: Any, reports: np.ndarray[Any, Any],
     ) -> None:  # fmt: skip
         """Compile, or load from the cache, all that a scan needs: by a drive of another ego past
         nobody.  No slot may be in use."""
@@ -96,7 +96,7 @@ class RoadFrame:
             other.move(t_ns, 20.0, 0.0)
             other.localise_(scan, scan.z, scan.std)
             other.watch_(bank, objects, scan, slot, status, age)
-            other.judge_changes_(ids, reports, t_ns)
+            other.judge_(ids, memory, reports, t_ns)
             other.globalise_(reports, 0)
         for x, P in ((other.x, other.P), (other._past, other._P_past)):
             guides.change_lane_(x, P, other._guide_slot, 0, other.width)
@@ -164,7 +164,7 @@ class RoadFrame:
             self._notes = np.zeros((SCANS, len(objects)), guides.NOTE_DTYPE)
             self._changes = np.zeros(len(objects), CHANGES_DTYPE)
             self._changes["t"] = np.nan
-            self._p = np.zeros((len(objects), 2))
+            self._p = np.zeros((len(objects), 4))
         with np.errstate(over="ignore"):  # a row that is not used may say anything
             r = np.square(scan.std)
             r[:, 2] += np.square(scan.lasting)
@@ -213,20 +213,25 @@ class RoadFrame:
         if not self._motion:
             self.x, self.P = self._past[: road.N_ROAD].copy(), self._without_guides()
 
-    def judge_changes_(
-        self, ids: IntArray, reports: np.ndarray[Any, np.dtype[np.void]], t_ns: int
+    def judge_(
+        self, ids: IntArray, memory: Any, reports: np.ndarray[Any, np.dtype[np.void]], t_ns: int
     ) -> None:
-        """Say in the reports of all slots in use who changed lanes at a time [ns], in place; see
-        `estimation.changing`."""
+        """Say in the reports of all slots in use who changed lanes at a time [ns], and who
+        approaches or recedes since the ego changes its speed, in place.
+
+        Without the ego's motion nothing is known of the road, and it is taken to be straight.
+        """
         n = int((ids >= 0).sum())
         tell_changes_(self._changes, ids, t_ns * 1e-9, self._p)
         judge_changes_(self._p, reports, n)
-        judge_ramps_(self.acceleration, reports, n)
+        if not math.isnan(self.speed):
+            doubtful = self._par[road.P_DOUBTFUL]
+            doubt_(self.x, self.P, doubtful, self.speed, self._h, ids, memory, reports)
+            judge_ramps_(self.acceleration, reports, n)
 
-    def changing(self, slot: int, t: float) -> tuple[float, float]:
-        """How probable it is that the object in a slot was changing lanes at a time t [s], to the
-        left and to the right; NaN if nothing is known."""
-        return probabilities(self._changes[slot], t)
+    def changing(self, slot: int, t: float) -> tuple[float, float, float, float]:
+        """Whether the object in a slot was changing lanes at a time t [s]; see `changing.look`."""
+        return look(self._changes[slot], t)
 
     def last_seen(self, slot: int) -> float:
         """When it was last seen whether the object in a slot changes lanes [s]."""

@@ -28,13 +28,13 @@ from typing import Any
 import numpy as np
 
 from can_imm.estimation.entry import entry_point
-from can_imm.estimation.road import N_ROAD, P_SURE
+from can_imm.estimation.road import N_ROAD, P_DOUBTFUL, P_SURE
 from can_imm.estimation.smoother import smooth_
 from can_imm.estimation.smoother_pairs import SMOOTHER_DTYPE
 from can_imm.hindsight import LOOK_AHEAD_S, Hindsight
 from can_imm.manoeuvres import ModeBank
 from can_imm.relations import MEMORY_DTYPE, hesitate_, relate_, shift_lanes_
-from can_imm.reporting import globalise_, judge_changes_, judge_ramps_
+from can_imm.reporting import doubt_, globalise_, judge_changes_, judge_ramps_
 from can_imm.road import RoadFrame
 from can_imm.smoothing_rows import COASTING, FIRST, Reports, Rows, conclude_rows_, measurements
 from can_imm.types import REPORT_DTYPE, BoolArray, CanImmError, FloatArray, IntArray, Scan, Y
@@ -86,9 +86,9 @@ class _Scan:
         tracks, slots, rows: the reports' tracks, their slots and their rows counted from the
             tracks' first.
         moved: lanes that the ego moved to the left.
-        road: state of the road, None without one.
+        road, road_cov: state and covariance of the road, None and empty without one.
         ego_speed, acceleration: of the ego [m/s, m/s²], NaN where unknown.
-        changes: (n, 2) for `reporting.judge_changes_`.
+        changes: (n, 4) for `reporting.judge_changes_`.
     """
 
     now: int
@@ -98,9 +98,10 @@ class _Scan:
     rows: list[int]
     moved: int
     road: FloatArray | None = None
+    road_cov: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     ego_speed: float = math.nan
     acceleration: float = math.nan
-    changes: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    changes: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
 
 
 class _Smoother:
@@ -152,7 +153,7 @@ class _Smoother:
         if road is not None:
             # the filter's lane 0 is now another one
             self._shift += moved * road.width
-            noted.road = road.x.copy()
+            noted.road, noted.road_cov = road.x.copy(), road.P.copy()
             noted.ego_speed, noted.acceleration = road.speed, road.acceleration
             if self._hindsight is not None:
                 number = self._hindsight.add(now, road, self._shift)
@@ -233,7 +234,12 @@ class _Smoother:
             self._ids[scan.slots] = reports["object_id"]
             if self._road is not None:
                 judge_changes_(scan.changes, reports, n)
-                judge_ramps_(scan.acceleration, reports, n)
+                if not math.isnan(scan.ego_speed):
+                    doubt_(
+                        scan.road, scan.road_cov, self._road[P_DOUBTFUL], scan.ego_speed,
+                        self._h, self._ids, self._memory, reports,
+                    )  # fmt: skip
+                    judge_ramps_(scan.acceleration, reports, n)
                 hesitate_(self._ids, self._memory, self._road[P_SURE], reports, n)
             relate_(self._ids, self._memory, reports, n)
             globalise_(scan.road, self._h, reports, n, scan.ego_speed)
@@ -376,7 +382,9 @@ class FixedLagSmoother(_Smoother):
         self._frame = road
         if road is not None:
             noted = self._pending[-1]
-            noted.changes = np.array([road.changing(s, noted.t) for s in noted.slots])
+            noted.changes = np.array([road.changing(s, noted.t) for s in noted.slots]).reshape(
+                -1, 4
+            )
 
     def end(self, slot: int) -> None:
         """The track in this slot ended; what is pending of it will still be said."""

@@ -175,6 +175,7 @@ REPORT_DTYPE = np.dtype(
         ("cov", np.float64, (4, 4)),
         ("p", np.float64, (N_MANOEUVRES,)),
         ("ego_speed", np.float64),
+        ("change", np.float64, (2,)),
         ("object_id", np.int32),
         ("duplicate_of", np.int32),
         ("age", np.int32),
@@ -191,7 +192,9 @@ REPORT_DTYPE = np.dtype(
 
 ``t_ns`` time for which it holds: that of the step which took the scan; ``age`` number of scans in
 which the object was seen; ``manoeuvre`` and ``second`` are values of `Manoeuvre`; ``direction`` of
-a lane change: +1 left, -1 right, 0 none;
+a lane change: +1 left, -1 right, 0 none; ``change`` when the lane change that is under way or
+has just ended began and ends, as far as is known now [s], NaN if there is none or with a preset
+that does not tell;
 ``lane`` with two lanes 0 right, 1 left; otherwise 0 the ego's, +1 the next to the left;
 ``flags`` bits `CUT_IN`, `CUT_OUT`, `OVERTAKING_ANOTHER`; ``duplicate_of`` object id of an older
 track of the same vehicle, -1 if there is none; ``ego_speed`` [m/s], NaN if unknown;

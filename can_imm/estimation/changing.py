@@ -25,6 +25,7 @@ from can_imm.estimation.lane_changes import (
     N_LANES,
     STEADY_TIME,
     UNKNOWN,
+    Four,
     add_logs,
     correct,
     course,
@@ -238,7 +239,7 @@ def follow_(
             one.log_w[lane] -= 0.5 * lost
             best = max(best, one.log_w[lane])
     give_up_(one, best)
-    left, right = probabilities(one, t)
+    left, right, _, _ = look(one, t)
     if left + right > CALM or not r < UNKNOWN:
         one.kept = -1
     else:
@@ -339,23 +340,28 @@ def tell_changes_(
         changes: (capacity,) of `CHANGES_DTYPE`, by slot.
         ids: (capacity,) object id of each slot, -1 for a free one.
         t: [s], not longer ago than the time to settle.
-        p: (N, 2) written for each slot in use, in their order: changing to the left, to the right;
-            NaN where nothing is known.
+        p: (N, 4) written for each slot in use, in their order, see `look`.
     """
     row = 0
     for s in range(ids.shape[0]):
         if ids[s] < 0:
             continue
-        p[row, 0], p[row, 1] = probabilities(changes[s], t)
+        p[row, 0], p[row, 1], p[row, 2], p[row, 3] = look(changes[s], t)
         row += 1
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def probabilities(one: Any, t: float) -> tuple[float, float]:  # pragma: no cover - compiled
-    """Of a change to the left and to the right at time t [s]; NaN if nothing is known."""
+def look(one: Any, t: float) -> Four:  # pragma: no cover - compiled
+    """Whether a vehicle was changing lanes at time t [s].
+
+    Returns:
+        Probability that it was, to the left and to the right, NaN if nothing is known; mean begin
+        and end [s] of the change that is under way or has just ended, NaN if probably none.
+    """
     if one.t != one.t:
-        return np.nan, np.nan
+        return np.nan, np.nan, np.nan, np.nan
     left = right = keep = 0.0
+    weight, begin, end = np.zeros(2), np.zeros(2), np.zeros(2)
     for lane in range(N_LANES):
         keep += math.exp(one.log_w[lane])
     for q in range(one.n):
@@ -367,8 +373,16 @@ def probabilities(one: Any, t: float) -> tuple[float, float]:  # pragma: no cove
             left += w
         else:
             right += w
+        side = 0 if c.turn > 0 else 1
+        weight[side] += w
+        begin[side] += w * (c.start - t)
+        end[side] += w * (c.start - t + c.duration)
     total = left + right + keep
-    return left / total, right / total
+    side = 0 if weight[0] > weight[1] else 1
+    if weight[side] < 0.5 * total:
+        return left / total, right / total, np.nan, np.nan
+    w = weight[side]
+    return left / total, right / total, t + begin[side] / w, t + end[side] / w
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -78,6 +78,7 @@ PARAMETERS = (
     "change_rate",
     "change_steady",
     "settle",
+    "doubtful",
     "sure",
 )
 """Names of the parameters, in their order in the array.
@@ -96,7 +97,7 @@ course into another, ``beside_spread`` of its logarithm among vehicles, ``beside
 fast such a place is forgotten, ``*_error``: by how much more the variances of this
 estimate count; ``change_rate`` [1/s] of lane changes, ``change_steady``: share of them at a
 constant rate, ``settle`` [s]: so long after it a lane change may still turn out to be none;
-``sure``: see `relations.hesitate_`.
+``doubtful`` [m/s]: see `reporting.doubt_`; ``sure``: see `relations.hesitate_`.
 """
 (
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,
@@ -104,7 +105,7 @@ constant rate, ``settle`` [s]: so long after it a lane change may still turn out
     P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_WANDER_STD, P_WANDER_TIME, P_FREEDOM,
     P_FREEDOM_CHANGING, P_ERROR_WEIGHT, P_ERROR_MOST, P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST,
     P_HINDSIGHT, P_BESIDE_STD, P_BESIDE_SPREAD, P_BESIDE_RATE, P_BESIDE_ERROR, P_BESIDE_SPEED_ERROR,
-    P_CHANGE_RATE, P_CHANGE_STEADY, P_SETTLE, P_SURE,
+    P_CHANGE_RATE, P_CHANGE_STEADY, P_SETTLE, P_DOUBTFUL, P_SURE,
 ) = range(len(PARAMETERS))  # fmt: skip
 
 USUAL_SPEED = 25.0
