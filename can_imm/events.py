@@ -78,8 +78,8 @@ class Event:
 
 
 class _Row(NamedTuple):
-    """What of a report counts here; the fields of its dtype by name, then gap, speed, and when a lane
-    change began and ends [s]."""
+    """What of a report counts here; the fields of its dtype by name, then gap, speed, and when a
+    lane change began and ends [s]."""
 
     object_id: int
     t_ns: int
