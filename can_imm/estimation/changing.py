@@ -279,10 +279,15 @@ def learn_wander_(
     Args:
         dt: since the measurement before it [s].
     """
-    lane = 0
+    # a course that has come to its end is a lane that is kept, too
+    w = np.zeros(N_LANES)
     for other in range(N_LANES):
-        if one.log_w[other] > one.log_w[lane]:
-            lane = other
+        w[other] = math.exp(one.log_w[other])
+    for q in range(one.n):
+        c = one.course[q]
+        if one.t - c.start >= c.duration:
+            w[c.lane + c.turn] += math.exp(c.log_w)
+    lane = np.argmax(w)
     begins = lane != one.kept
     one.kept = lane
     off = y - (lane - EDGE) * width
