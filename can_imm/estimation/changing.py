@@ -404,7 +404,8 @@ def follow_all_(
     """
     h = np.zeros(road.shape[0] + 1)
     for s in range(changes.shape[0]):
-        if notes[s].new or notes[s].off > OFF:
+        # what was noted of one that was not seen is old
+        if notes[s].new or (notes[s].seen and notes[s].off > OFF):
             forget_changes_(changes[s])
     for k in range(n):
         s = slot[k]
