@@ -453,3 +453,6 @@ def shift_changes_(changes: Any, moved: int) -> None:  # pragma: no cover - comp
                     one.course[kept] = c
                 kept += 1
         one.n = kept
+        if kept == 0 and np.max(one.log_w) == -np.inf:
+            # it was in none of the lanes that are left
+            forget_changes_(one)
