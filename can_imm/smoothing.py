@@ -374,7 +374,7 @@ class FixedLagSmoother(_Smoother):
         self._frame = road
         if road is not None:
             noted = self._pending[-1]
-            noted.changes = np.array([road.changing(s, noted.t) for s in noted.slots])
+            noted.changes = np.array([road.changing(s, noted.t) for s in noted.slots]).reshape(-1, 2)
 
     def end(self, slot: int) -> None:
         """The track in this slot ended; what is pending of it will still be said."""
