@@ -12,7 +12,6 @@ from can_imm.estimation import guides, road
 from can_imm.estimation.changing import (
     CHANGES_DTYPE,
     follow_all_,
-    probabilities,
     shift_changes_,
     tell_changes_,
 )
@@ -140,7 +139,7 @@ class RoadFrame:
         if self._notes.shape[1] != len(objects):
             self._notes = np.zeros((SCANS, len(objects)), guides.NOTE_DTYPE)
             self._changes = np.zeros(len(objects), CHANGES_DTYPE)
-            self._changes["t"] = np.nan
+            self._changes["since"] = self._changes["t"] = np.nan
             self._p = np.zeros((len(objects), 2))
         with np.errstate(over="ignore"):  # a row that is not used may say anything
             r = np.square(scan.std)
@@ -198,14 +197,12 @@ class RoadFrame:
         tell_changes_(self._changes, ids, t_ns * 1e-9, self._p)
         judge_changes_(self._p, reports, int((ids >= 0).sum()))
 
-    def changing(self, slot: int, t: float) -> tuple[float, float]:
-        """How probable it is that the object in a slot was changing lanes at a time t [s], to the
-        left and to the right; NaN if nothing is known."""
-        return probabilities(self._changes[slot], t)
-
-    def last_seen(self, slot: int) -> float:
-        """When it was last seen whether the object in a slot changes lanes [s]."""
-        return float(self._changes["t"][slot])
+    def changing(self, t: float) -> FloatArray:
+        """How probable it is that the objects were changing lanes at a time t [s]: (capacity, 2) by
+        slot, to the left and to the right; NaN where nothing is known."""
+        p = np.empty((len(self._changes), 2))
+        tell_changes_(self._changes, np.zeros(len(p), np.int32), t, p)
+        return p
 
     def globalise_(self, reports: np.ndarray[Any, np.dtype[np.void]], n: int) -> None:
         """The first n reports from the road's axes into the sensor's, in place."""

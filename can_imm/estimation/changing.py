@@ -75,6 +75,7 @@ LONGEST_S = 1.0
 
 CHANGES_DTYPE = np.dtype(
     [
+        ("since", np.float64),
         ("t", np.float64),
         ("begun", np.float64),
         ("cov", np.float64, (3,)),
@@ -104,18 +105,18 @@ CHANGES_DTYPE = np.dtype(
     ],
     align=True,
 )
-"""What is thought of one vehicle: ``t`` time of its last measurement [s], NaN before the first one;
-``begun`` when courses began last; ``cov`` covariance of place and rate beside the course (P00, P01,
-P11).  By lane (0 to `N_LANES` - 1, `EDGE` the ego's): log weight of keeping it, place and rate [m,
-m/s].  ``kept``: the lane that it keeps, -1 while that is not sure; by level of wander: log
-``evidence`` for it, and covariance, place and rate if it were the true one.  The first ``n``
-courses that may be under way: see `lane_changes.COURSE_DTYPE`. """
+"""What is thought of one vehicle: ``since`` and ``t``, times of its first and its last measurement
+[s], NaN before; ``begun`` when courses began last; ``cov`` covariance of place and rate beside the
+course (P00, P01, P11).  By lane (0 to `N_LANES` - 1, `EDGE` the ego's): log weight of keeping it,
+place and rate [m, m/s].  ``kept``: the lane that it keeps, -1 while that is not sure; by level of
+wander: log ``evidence`` for it, and covariance, place and rate if it were the true one.  The first
+``n`` courses that may be under way: see `lane_changes.COURSE_DTYPE`. """
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def forget_changes_(one: Any) -> None:  # pragma: no cover - compiled
     """Nothing is known of the vehicle."""
-    one.t = np.nan
+    one.since = one.t = np.nan
     one.n = 0
     one.kept = -1
     one.evidence[:] = 0.0
@@ -183,6 +184,7 @@ def follow_(
     if not dt <= LONGEST_S:
         forget_changes_(one)
         begin_courses_(one, t, y, width, par)
+        one.since = t
         one.log_w[:] = 0.0
         one.place[:] = 0.0
         one.rate[:] = 0.0
@@ -345,7 +347,7 @@ def tell_changes_(
         ids: (capacity,) object id of each slot, -1 for a free one.
         t: [s], not longer ago than the time to settle.
         p: (N, 2) written for each slot in use, in their order: changing to the left, to the right;
-            NaN where nothing is known.
+            NaN where nothing was known then.
     """
     row = 0
     for s in range(ids.shape[0]):
@@ -357,8 +359,8 @@ def tell_changes_(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def probabilities(one: Any, t: float) -> tuple[float, float]:  # pragma: no cover - compiled
-    """Of a change to the left and to the right at time t [s]; NaN if nothing is known."""
-    if one.t != one.t:
+    """Of a change to the left and to the right at time t [s]; NaN if nothing was known then."""
+    if not t >= one.since:
         return np.nan, np.nan
     left = right = keep = 0.0
     for lane in range(N_LANES):
