@@ -211,6 +211,9 @@ def judge_changes_(p: FloatArray, reports: Any, n: int) -> None:
             other = _KEEP_LANE
             if abs(report.x[1]) > STEADY:
                 other = _RECEDING if report.x[1] > 0.0 else _APPROACHING
+            for i in range(1, report.p.shape[0]):
+                if i != _STATIONARY and i != _ONCOMING:
+                    report.p[i] = 0.0
             report.p[other] = ours * (1.0 - change)
         report.p[_LANE_CHANGE] = ours * change
         report.direction = 0
