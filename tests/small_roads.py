@@ -86,6 +86,7 @@ class Traffic:
         scan.z[:, 0] = xy[:, 0] * math.cos(angle) + xy[:, 1] * math.sin(angle)
         scan.z[:, 2] = xy[:, 1] * math.cos(angle) - xy[:, 0] * math.sin(angle)
         self.t_ns += round(dt * 1e9)
+        scan.t_ns = self.t_ns
         self.frame.move(self.t_ns, speed, yaw_rate)
         for s in slots:
             self.age[s] += 1
