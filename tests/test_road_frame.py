@@ -296,8 +296,11 @@ def test_past_and_present_count_the_lanes_alike(offset: float, hindsight: float)
     frame = copy.deepcopy(traffic.frame)
     frame.move(traffic.t_ns + S // 10, 25.0, 0.0)
     present = frame.x.copy()
+    lanes = traffic.frame._changes["log_w"][:2].argmax(axis=1)
     assert traffic.scan([0, 1], xy, speed=25.0, yaw_rate=0.0) == side
     width = traffic.width
+    seen = traffic.frame._changes["log_w"][:2].argmax(axis=1)
+    np.testing.assert_array_equal(seen, lanes - side)
     np.testing.assert_allclose(traffic.objects["mean"][:, 2], 0.7 - side * width)
     np.testing.assert_allclose(traffic.objects["x"][:, 1, 2], 0.7 - side * width)
     assert traffic.offset == pytest.approx(present[road.OFFSET] - side * width, abs=1e-9)
@@ -424,11 +427,12 @@ def test_vehicles_are_followed_in_the_axes_of_the_road(side: int, angle: float) 
     traffic = Traffic(parameters(), capacity=6)
     ids = np.array([7, 8, FREE, 9, 10, 11], np.int32)
     reports = np.zeros(6, REPORT_DTYPE)
-    x = np.array([40.0, 50.0, 60.0, 65.0, 70.0])
+    first = np.array([40.0, 50.0, 60.0, 65.0, 70.0])
     lanes = np.array([1.0, -1.0, 0.0, 1.0, -1.0])
     said = []
     for k in range(140):
         u = min(max((0.1 * k - 10.0) / 4.0, 0.0), 1.0)
+        x = first - 0.15 * k
         y = 3.5 * lanes + 0.5 * curvature * x**2
         y[2] -= side * 3.5 * u * u * (3.0 - 2.0 * u)
         # its modes know, too, so that it does not guide

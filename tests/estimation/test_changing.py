@@ -255,7 +255,15 @@ def test_a_course_that_settled_is_one_with_its_lane(case: tuple[int, int, float,
     courses = one["course"][: one["n"]]
     assert (t[-1] - courses["start"] < courses["duration"] + 1.0).all()
     assert p[-1].sum() < 0.05
-    assert one["log_w"].argmax() == lc.EDGE + lane + side
+    there = lc.EDGE + lane + side
+    assert one["log_w"].argmax() == there
+    # it is where the best course was
+    other = nobody()
+    follow_each(other, one_level(settle=NEVER), t, y, vy, 0.0)
+    courses = other["course"][: other["n"]]
+    best = courses[courses["log_w"].argmax()]
+    assert one["place"][there] == pytest.approx(best["place"], abs=0.01)
+    assert one["rate"][there] == pytest.approx(best["rate"], abs=0.01)
 
 
 # ---- how much a vehicle wanders
