@@ -421,18 +421,18 @@ def test_of_whom_nothing_is_known_the_modes_have_their_say() -> None:
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("angle", [0.0, 0.05])
 def test_vehicles_are_followed_in_the_axes_of_the_road(side: int, angle: float) -> None:
-    """In a bend that the ego and all others drive, up to 5 m to the side of where it looks; one of
+    """In a bend that the ego and all others drive, up to 10 m to the side of where it looks; one of
     them leaves its lane to the outside."""
     curvature, speed = 0.002 * side, 30.0
     traffic = Traffic(parameters(), capacity=6)
     ids = np.array([7, 8, FREE, 9, 10, 11], np.int32)
     reports = np.zeros(6, REPORT_DTYPE)
-    first = np.array([40.0, 50.0, 60.0, 65.0, 70.0])
+    first = np.array([80.0, 85.0, 90.0, 95.0, 100.0])
     lanes = np.array([1.0, -1.0, 0.0, 1.0, -1.0])
     said = []
     for k in range(140):
         u = min(max((0.1 * k - 10.0) / 4.0, 0.0), 1.0)
-        x = first - 0.15 * k
+        x = first - 0.4 * k
         y = 3.5 * lanes + 0.5 * curvature * x**2
         y[2] -= side * 3.5 * u * u * (3.0 - 2.0 * u)
         # its modes know, too, so that it does not guide
