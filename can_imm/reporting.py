@@ -201,14 +201,13 @@ def judge_changes_(p: FloatArray, reports: Any, n: int) -> None:
     The probability of what else they do stays as it is, but for the common factor.
 
     Args:
-        p: (n, 4) see `estimation.changing.look`; NaN where nothing is known: there the report is
-            left alone.
+        p: (n, 2) probabilities of changing to the left and to the right, see `estimation.changing`;
+            NaN where nothing is known: there the report is left alone.
     """
     for k in range(n):
         if p[k, 0] != p[k, 0]:
             continue
         report = reports[k]
-        report.change[0], report.change[1] = p[k, 2], p[k, 3]
         change = p[k, 0] + p[k, 1]
         others = ours = 0.0
         for i in range(1, report.p.shape[0]):
@@ -224,6 +223,9 @@ def judge_changes_(p: FloatArray, reports: Any, n: int) -> None:
             other = _KEEP_LANE
             if abs(report.x[1]) > STEADY:
                 other = _RECEDING if report.x[1] > 0.0 else _APPROACHING
+            for i in range(1, report.p.shape[0]):
+                if i != _STATIONARY and i != _ONCOMING:
+                    report.p[i] = 0.0
             report.p[other] = ours * (1.0 - change)
         report.p[_LANE_CHANGE] = ours * change
         report.direction = 0

@@ -12,9 +12,9 @@ from can_imm.estimation import guides, road
 from can_imm.estimation.changing import (
     CHANGES_DTYPE,
     follow_all_,
-    look,
     shift_changes_,
     tell_changes_,
+    tell_times_,
 )
 from can_imm.reporting import doubt_, globalise_, judge_changes_, judge_ramps_
 from can_imm.types import VY, FloatArray, IntArray, Scan
@@ -59,7 +59,7 @@ class RoadFrame:
         self._guide_unseen = np.zeros(road.N_GUIDES)
         self._notes: np.ndarray[Any, np.dtype[np.void]] = np.zeros((SCANS, 0), guides.NOTE_DTYPE)
         self._changes: np.ndarray[Any, np.dtype[np.void]] = np.zeros(0, CHANGES_DTYPE)
-        self._p: FloatArray = np.zeros((0, 4))
+        self._p: FloatArray = np.zeros((0, 2))
         # the filter as of the last scan that was learnt from; the ego's motion of those since
         self._past, self._P_past = road.new_road(par)
         self._motion: deque[tuple[float, float, float]] = deque()
@@ -163,8 +163,8 @@ class RoadFrame:
         if self._notes.shape[1] != len(objects):
             self._notes = np.zeros((SCANS, len(objects)), guides.NOTE_DTYPE)
             self._changes = np.zeros(len(objects), CHANGES_DTYPE)
-            self._changes["t"] = np.nan
-            self._p = np.zeros((len(objects), 4))
+            self._changes["since"] = self._changes["t"] = np.nan
+            self._p = np.zeros((len(objects), 2))
         with np.errstate(over="ignore"):  # a row that is not used may say anything
             r = np.square(scan.std)
             r[:, 2] += np.square(scan.lasting)
@@ -224,18 +224,18 @@ class RoadFrame:
         n = int((ids >= 0).sum())
         tell_changes_(self._changes, ids, t_ns * 1e-9, self._p)
         judge_changes_(self._p, reports, n)
+        tell_times_(self._changes, ids, reports)
         if not math.isnan(self.speed):
             doubtful = self._par[road.P_DOUBTFUL]
             doubt_(self.x, self.P, doubtful, self.speed, self._h, ids, memory, reports)
             judge_ramps_(self.acceleration, reports, n)
 
-    def changing(self, slot: int, t: float) -> tuple[float, float, float, float]:
-        """Whether the object in a slot was changing lanes at a time t [s]; see `changing.look`."""
-        return look(self._changes[slot], t)
-
-    def last_seen(self, slot: int) -> float:
-        """When it was last seen whether the object in a slot changes lanes [s]."""
-        return float(self._changes["t"][slot])
+    def changing(self, t: float) -> FloatArray:
+        """How probable it is that the objects were changing lanes at a time t [s]: (capacity, 2) by
+        slot, to the left and to the right; NaN where nothing is known."""
+        p = np.empty((len(self._changes), 2))
+        tell_changes_(self._changes, np.zeros(len(p), np.int32), t, p)
+        return p
 
     def globalise_(self, reports: np.ndarray[Any, np.dtype[np.void]], n: int) -> None:
         """The first n reports from the road's axes into the sensor's, in place."""

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from can_imm.estimation.entry import entry_point
-from can_imm.estimation.road import N_ROAD, P_DOUBTFUL, P_SURE
+from can_imm.estimation.road import N_ROAD, P_DOUBTFUL, P_SETTLE, P_SURE
 from can_imm.estimation.smoother import smooth_
 from can_imm.estimation.smoother_pairs import SMOOTHER_DTYPE
 from can_imm.hindsight import LOOK_AHEAD_S, Hindsight
@@ -59,7 +59,6 @@ class _Track:
         rows: its rows without the first ``base`` ones, which are forgotten.
         told: the first of them of which nothing was said yet.
         last: number of the step of the last measurement, -1 before the first.
-        seen: time of the last measurement [s].
         said: number of rows that have been said.
         ended: nothing will be added.
         out: smoothed reports that wait to be said.
@@ -71,7 +70,6 @@ class _Track:
         self.base = 0
         self.told = 0
         self.last = -1
-        self.seen = math.nan
         self.said = 0
         self.ended = False
         self.out: Reports = np.zeros(0, REPORT_DTYPE)
@@ -88,7 +86,7 @@ class _Scan:
         moved: lanes that the ego moved to the left.
         road, road_cov: state and covariance of the road, None and empty without one.
         ego_speed, acceleration: of the ego [m/s, m/s²], NaN where unknown.
-        changes: (n, 4) for `reporting.judge_changes_`.
+        changes: (n, 2) for `reporting.judge_changes_`.
     """
 
     now: int
@@ -101,7 +99,7 @@ class _Scan:
     road_cov: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     ego_speed: float = math.nan
     acceleration: float = math.nan
-    changes: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
+    changes: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 class _Smoother:
@@ -184,7 +182,7 @@ class _Smoother:
                 rows.steps[k] = COASTING
                 continue
             rows.steps[k] = now - track.last if track.last >= 0 else FIRST
-            track.last, track.seen = now, noted.t
+            track.last = now
             rows.x[k], rows.P[k] = x[place], P[place]
             rows.mu[k], rows.Pi[k] = mu[place], Pi[place]
             rows.z[k], rows.r[k] = z[self._row_of[place]], r[self._row_of[place]]
@@ -363,7 +361,7 @@ class FixedLagSmoother(_Smoother):
             raise CanImmError(f"the lag must be a step of the loop or longer, not {lag_s:g} s")
         super().__init__(bank)
         self._road = bank.road
-        self._frame: RoadFrame | None = None
+        self._settle = math.inf if bank.road is None else float(bank.road[P_SETTLE])
 
     def scan(
         self,
@@ -379,12 +377,14 @@ class FixedLagSmoother(_Smoother):
     ) -> None:
         """Write a scan down; see `detector.History`."""
         super().scan(now, objects, ids, measured, reports, road, moved, scan, slot)
-        self._frame = road
-        if road is not None:
-            noted = self._pending[-1]
-            noted.changes = np.array([road.changing(s, noted.t) for s in noted.slots]).reshape(
-                -1, 4
-            )
+        if road is None or self._road is None:
+            return
+        noted = self._pending[-1]
+        noted.changes = np.full((len(noted.slots), 2), np.nan)
+        for earlier in reversed(self._pending):
+            if noted.t - earlier.t > self._settle:
+                break
+            self._look_back(earlier, road)
 
     def end(self, slot: int) -> None:
         """The track in this slot ended; what is pending of it will still be said."""
@@ -392,10 +392,6 @@ class FixedLagSmoother(_Smoother):
         if track is None:
             return
         track.ended = True
-        # unless the slot has been given to another object
-        if self._frame is not None and self._frame.last_seen(slot) == track.seen:
-            for scan in self._pending:
-                self._look_back(scan, track)
         if track.said == track.base + track.rows.n:
             self._free.append(track.rows)
 
@@ -417,8 +413,6 @@ class FixedLagSmoother(_Smoother):
     def _say(self) -> tuple[int, Reports]:
         scan = self._pending.popleft()
         for place, (track, row) in enumerate(zip(scan.tracks, scan.rows, strict=True)):
-            if not track.ended:
-                self._look_back(scan, track)
             rows, k = track.rows, row - track.base
             self._go_back(rows, k, k + 1, self._out[place : place + 1])
             track.said = row + 1
@@ -433,8 +427,10 @@ class FixedLagSmoother(_Smoother):
         n = len(scan.tracks)
         return self._relate(scan, self._out[:n])
 
-    def _look_back(self, scan: _Scan, track: _Track) -> None:
-        """What is thought now of whether the track's vehicle was changing lanes in a scan."""
-        if self._frame is not None and track in scan.tracks:
-            k = scan.tracks.index(track)
-            scan.changes[k] = self._frame.changing(scan.slots[k], scan.t)
+    def _look_back(self, scan: _Scan, road: RoadFrame) -> None:
+        """What is thought now of who was changing lanes in a scan, but for tracks that have ended;
+        further back than it takes to settle that is forgotten."""
+        known = road.changing(scan.t)[scan.slots]
+        for k, track in enumerate(scan.tracks):
+            if not track.ended and not math.isnan(known[k, 0]):
+                scan.changes[k] = known[k]

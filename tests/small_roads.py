@@ -22,8 +22,9 @@ USUAL = {
     "yaw_noise": 0.001, "yaw_noise_unknown": 0.01, "drift": 0.05,
     "wander_std": 0.2, "wander_time": 4.0, "freedom": 0.1, "freedom_changing": 1.0,
     "error_weight": 3.0, "error_most": 0.5, "speed_error_weight": 10.0, "speed_error_most": 2.0,
-    "beside_std": 0.35, "beside_spread": 0.5, "beside_rate": 0.5, "beside_error": 1.0, "beside_speed_error": 1.0,
-    "change_rate": 0.03, "change_steady": 0.1, "settle": 1.0, "doubtful": 0.5, "hindsight": 0.5, "sure": 0.5,
+    "hindsight": 0.5, "beside_std": 0.35, "beside_spread": 0.5, "beside_rate": 0.5,
+    "beside_error": 1.0, "beside_speed_error": 1.0, "change_rate": 0.03, "change_steady": 0.1,
+    "settle": 1.0, "doubtful": 0.5, "sure": 0.5,
 }  # fmt: skip
 
 
@@ -85,6 +86,7 @@ class Traffic:
         scan.z[:, 0] = xy[:, 0] * math.cos(angle) + xy[:, 1] * math.sin(angle)
         scan.z[:, 2] = xy[:, 1] * math.cos(angle) - xy[:, 0] * math.sin(angle)
         self.t_ns += round(dt * 1e9)
+        scan.t_ns = self.t_ns
         self.frame.move(self.t_ns, speed, yaw_rate)
         for s in slots:
             self.age[s] += 1

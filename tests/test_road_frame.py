@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import norm
 from small_roads import KEEP, LEFT, Traffic, parameters
 
 from can_imm.estimation import guides, road
-from can_imm.relations import MEMORY_DTYPE
-from can_imm.reporting import WANDER_SPEED
+from can_imm.reporting import judge_changes_
 from can_imm.road import LONGEST_S, SCANS, RoadFrame
 from can_imm.types import REPORT_DTYPE, Manoeuvre, Scan
 
@@ -298,8 +296,11 @@ def test_past_and_present_count_the_lanes_alike(offset: float, hindsight: float)
     frame = copy.deepcopy(traffic.frame)
     frame.move(traffic.t_ns + S // 10, 25.0, 0.0)
     present = frame.x.copy()
+    lanes = traffic.frame._changes["log_w"][:2].argmax(axis=1)
     assert traffic.scan([0, 1], xy, speed=25.0, yaw_rate=0.0) == side
     width = traffic.width
+    seen = traffic.frame._changes["log_w"][:2].argmax(axis=1)
+    np.testing.assert_array_equal(seen, lanes - side)
     np.testing.assert_allclose(traffic.objects["mean"][:, 2], 0.7 - side * width)
     np.testing.assert_allclose(traffic.objects["x"][:, 1, 2], 0.7 - side * width)
     assert traffic.offset == pytest.approx(present[road.OFFSET] - side * width, abs=1e-9)
@@ -343,81 +344,118 @@ def test_reports_go_back_to_the_sensors_axes() -> None:
     assert reports["ego_speed"].tolist() == [30.0, 30.0, 0.0]
 
 
-LC, KL = int(Manoeuvre.LANE_CHANGE), int(Manoeuvre.KEEP_LANE)
+# ---- who changes lanes
+
+LC, KL = Manoeuvre.LANE_CHANGE, Manoeuvre.KEEP_LANE
+RELATIVE = [m for m in Manoeuvre if m > 0 and m not in (Manoeuvre.STATIONARY, Manoeuvre.ONCOMING)]
+OTHERS = [m for m in RELATIVE if m != LC]
+SHARES = st.floats(0.0, 1.0)
 
 
-def lane_changes(p: float) -> np.ndarray:
-    """At 20 to 150 m, as fast as the ego but for the second and the third."""
-    reports = np.zeros(4, REPORT_DTYPE)
-    reports["x"] = [(20, 0.5, 0, 1.8), (90, -2, 0, -0.9), (90, 2, 0, 0.9), (150, 0, 0, 0.05)]
-    reports["p"][:, LC], reports["p"][:, KL] = p, 1.0 - p
-    reports["manoeuvre"], reports["second"], reports["direction"] = LC, KL, -1
-    return reports
+def judged(p: Any, change: tuple[float, float], vx: float = 0.0, direction: int = 1) -> Any:
+    """The report that is made of one with these probabilities."""
+    reports = np.zeros(2, REPORT_DTYPE)
+    reports["p"] = p
+    reports["x"][:, 1] = vx
+    reports["direction"] = direction
+    untouched = reports.copy()
+    judge_changes_(np.array([change, change]), reports, 1)
+    for name in REPORT_DTYPE.names or ():
+        np.testing.assert_array_equal(reports[name][1], untouched[name][1], "only the first n")
+    return reports[0]
 
 
-@pytest.mark.parametrize("way", [0.0, 20.0])
-def test_lane_changes_are_trusted_no_further_than_the_road_is_known(way: float) -> None:
-    """A road that bends unseen explains a lateral speed by the uncertainty of its direction, and
-    that times the vehicle's speed; of the direction by quadrature of the bends."""
-    frame = driven(3.0).frame
-    frame.x[road.WAY] = way
-    frame.P /= 25.0
-    reports = lane_changes(0.8)
-    frame.doubt_(np.arange(4, dtype=np.int32), np.zeros(4, MEMORY_DTYPE), reports)
-    knots = road.SPACING * np.arange(road.N_KNOTS)
-    shares = []
-    for x, vx, _, vy in lane_changes(0.8)["x"].tolist():
-        u = way + (np.arange(20000) + 0.5) * x / 20000
-        h = np.zeros(road.N_ROAD)
-        h[[road.HEADING, road.MOUNTING]] = -1.0
-        for i in range(road.N_KNOTS):
-            h[road.KNOT + i] = np.interp(u, knots, np.eye(road.N_KNOTS)[i]).mean() * x
-        std = math.hypot(WANDER_SPEED, (30.0 + vx) * math.sqrt(h @ frame.P @ h))
-        shares.append(1.0 / (1.0 + 0.5 * math.sqrt(2.0 * math.pi) * norm.pdf(vy, 0.0, std)))
-    assert shares[0] > 0.9
-    assert shares[3] < 0.7
-    rest = [KL, int(Manoeuvre.APPROACHING), int(Manoeuvre.RECEDING), KL]
-    expected = np.zeros_like(reports["p"])
-    expected[:, KL] = 0.2
-    expected[np.arange(4), rest] += 0.8 * (1.0 - np.array(shares))
-    expected[:, LC] = 0.8 * np.array(shares)
-    np.testing.assert_allclose(reports["p"], expected, rtol=1e-4, atol=1e-9)
-    np.testing.assert_array_equal(reports["manoeuvre"], expected[:, 1:].argmax(axis=1) + 1)
-    assert (reports["direction"] == np.where(reports["manoeuvre"] == LC, -1, 0)).all()
-    assert len(set(reports["manoeuvre"].tolist())) > 1, "some were doubted away, some not"
+@given(st.lists(SHARES, min_size=len(Manoeuvre) - 1, max_size=len(Manoeuvre) - 1), SHARES, SHARES)
+def test_who_changes_lanes_is_said_by_the_filter_and_the_rest_by_the_modes(
+    shares: list[float], change: float, left: float
+) -> None:
+    p = np.array([0.0, *shares])
+    p[1:] += 0.01
+    p /= p.sum()
+    report = judged(p, (change * left, change - change * left))
+    ours = p[RELATIVE].sum()
+    expected = p.copy()
+    expected[OTHERS] *= ours * (1.0 - change) / p[OTHERS].sum()
+    expected[LC] = ours * change
+    np.testing.assert_allclose(report["p"], expected, atol=1e-12)
+    np.testing.assert_array_equal(report["p"][[Manoeuvre.STATIONARY, Manoeuvre.ONCOMING]],
+                                  p[[Manoeuvre.STATIONARY, Manoeuvre.ONCOMING]])  # fmt: skip
+    assert report["probability"] == report["p"][1:].max() == report["p"][report["manoeuvre"]]
+    assert report["second_probability"] == np.sort(report["p"][1:])[-2]
+    if report["manoeuvre"] != LC:
+        assert report["direction"] == 0
+    elif abs(left - 0.5) > 1e-6:
+        assert report["direction"] == (1 if left > 0.5 else -1)
 
 
-def test_what_is_hardly_a_lane_change_and_what_nobody_is_in_is_not_doubted() -> None:
-    frame = driven(3.0).frame
-    for p, first in ((0.009, 0), (0.8, FREE)):
-        reports = lane_changes(p)
-        ids = np.full(4, first, np.int32)
-        frame.doubt_(ids, np.zeros(4, MEMORY_DTYPE), reports)
-        np.testing.assert_array_equal(reports, lane_changes(p))
+@pytest.mark.parametrize(
+    ("vx", "expected"),
+    [
+        (0.0, KL), (0.5, KL), (-0.5, KL),
+        (0.7, Manoeuvre.RECEDING), (-0.7, Manoeuvre.APPROACHING),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("rest", [0.0, 1e-5])
+def test_where_the_modes_know_of_nothing_else_the_speed_tells(
+    vx: float, expected: int, rest: float
+) -> None:
+    p = np.zeros(REPORT_DTYPE["p"].shape)
+    p[[LC, Manoeuvre.KEEP_LEFT]] = 0.9 - rest, rest
+    p[Manoeuvre.ONCOMING] = 0.1
+    report = judged(p, (0.1, 0.2), vx)
+    assert report["p"][LC] == pytest.approx(0.9 * 0.3)
+    assert report["p"][expected] == pytest.approx(0.9 * 0.7)
+    assert report["p"].sum() == pytest.approx(1.0, abs=1e-9)
+    assert report["manoeuvre"] == expected
+    assert report["direction"] == 0
 
 
-def test_a_lane_change_that_was_trusted_stays_so_until_it_is_over() -> None:
-    """It ends slowly, and then looks like a bend; another one is to be trusted anew."""
-    frame = driven(3.0).frame
-    ids, memory = np.array([FREE, 7], np.int32), np.zeros(2, MEMORY_DTYPE)
-
-    def trusted(vy: float, p: float = 0.8) -> float:
-        reports = lane_changes(p)[:1]
-        reports["x"][0, 3], reports["age"] = vy, 5
-        frame.doubt_(ids, memory, reports)
-        return float(reports["p"][0, LC] / p)
-
-    doubted = trusted(0.05)
-    assert doubted < 0.5
-    fast = trusted(1.8)
-    assert fast > 0.9
-    assert trusted(0.05) == pytest.approx(fast)
-    trusted(0.05, p=0.1)
-    assert trusted(0.05) == pytest.approx(doubted)
+def test_of_whom_nothing_is_known_the_modes_have_their_say() -> None:
+    p = np.zeros(REPORT_DTYPE["p"].shape)
+    p[[LC, KL]] = 0.7, 0.3
+    report = judged(p, (NAN, NAN), direction=-1)
+    np.testing.assert_array_equal(report["p"], p)
+    assert report["direction"] == -1
 
 
-def test_without_the_egos_speed_nothing_is_doubted() -> None:
-    frame = driven(3.0, NAN, 0.02).frame
-    reports = lane_changes(0.8)
-    frame.doubt_(np.arange(4, dtype=np.int32), np.zeros(4, MEMORY_DTYPE), reports)
-    np.testing.assert_array_equal(reports, lane_changes(0.8))
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("angle", [0.0, 0.05])
+def test_vehicles_are_followed_in_the_axes_of_the_road(side: int, angle: float) -> None:
+    """In a bend that the ego and all others drive, up to 10 m to the side of where it looks; one of
+    them leaves its lane to the outside."""
+    curvature, speed = 0.002 * side, 30.0
+    traffic = Traffic(parameters(), capacity=6)
+    ids = np.array([7, 8, FREE, 9, 10, 11], np.int32)
+    reports = np.zeros(6, REPORT_DTYPE)
+    first = np.array([80.0, 85.0, 90.0, 95.0, 100.0])
+    lanes = np.array([1.0, -1.0, 0.0, 1.0, -1.0])
+    said = []
+    for k in range(140):
+        u = min(max((0.1 * k - 10.0) / 4.0, 0.0), 1.0)
+        x = first - 0.4 * k
+        y = 3.5 * lanes + 0.5 * curvature * x**2
+        y[2] -= side * 3.5 * u * u * (3.0 - 2.0 * u)
+        # its modes know, too, so that it does not guide
+        traffic.objects["mu"][3, [KEEP, LEFT]] = float(u == 0.0), float(u > 0.0)
+        traffic.scan(
+            [0, 1, 3, 4, 5], np.column_stack([x, y]),
+            speed=speed, yaw_rate=curvature * speed, angle=angle, speeds=False,
+        )  # fmt: skip
+        reports["p"] = 0.0
+        reports["p"][:, [KL, LC]] = 0.5
+        traffic.frame.judge_changes_(ids, reports, traffic.t_ns)
+        said.append(reports[:5].copy())
+    p = np.array(said)["p"][:, :, LC]
+    keepers = [0, 1, 3, 4]
+    assert p[20:, keepers].max() < 0.3, "they follow the road"
+    assert p[20:100, 2].max() < 0.3
+    assert p[100:, 2].max() > 0.99
+    turned = said[100 + int(p[100:, 2].argmax())][2]
+    assert turned["manoeuvre"] == LC
+    assert turned["direction"] == -side
+    # told by slot of a time that has passed
+    then = traffic.frame.changing(12.0)
+    assert then[3, 0 if side < 0 else 1] > 0.99
+    assert np.nanmax(then[[0, 1, 4, 5]]) < 0.1
+    assert np.isnan(then[2]).all(), "nobody is there"
+    assert np.isnan(traffic.frame.changing(0.05)).all(), "before the first scan"

@@ -10,7 +10,7 @@ import pytest
 
 from can_imm import smoothing
 from can_imm.detector import Detector
-from can_imm.estimation.road import WIDTH
+from can_imm.estimation.road import P_SETTLE, WIDTH
 from can_imm.manoeuvres import load_bank
 from can_imm.road import RoadFrame
 from can_imm.smoothing import FixedIntervalSmoother, FixedLagSmoother
@@ -301,3 +301,136 @@ def test_a_lane_change_of_the_ego_is_no_motion_of_the_others(lag: float) -> None
         np.testing.assert_allclose(b["p"], a["p"], atol=1e-9)
         np.testing.assert_array_equal(b["ego_speed"], 20.0)
         assert b.dtype == REPORT_DTYPE
+
+
+# ---- lane changes on a motorway
+
+MOTORWAY = load_bank("motorway")
+TURN_S = 2.0
+
+
+def motorway(seconds: float) -> list[Scan]:
+    """Scans of 100 ms: two keep their lanes, one changes to the left from `TURN_S` on."""
+    rng = np.random.default_rng(7)
+    scans = []
+    for k in range(round(10 * seconds)):
+        t = 0.1 * k
+        u = min(max((t - TURN_S) / 4.0, 0.0), 1.0)
+        scan = Scan(3)
+        scan.t_ns, scan.n = k * 100_000_000, 3
+        scan.ego_speed, scan.ego_yaw_rate = 28.0, 0.0
+        scan.ids[:] = 1, 2, 3
+        scan.std[:], scan.valid[:] = (0.2, 0.15, 0.1, 0.15), True
+        scan.z[:] = [(40, 0, -3.5, 0), (50, 0, 3.5, 0), (30, 0, 0, 0)]
+        scan.z[2, 2] += 3.5 * u * u * (3 - 2 * u)
+        scan.z[2, 3] = 3.5 * 6 * u * (1 - u) / 4.0
+        scan.z += rng.normal(0.0, scan.std)
+        scans.append(scan)
+    return scans
+
+
+def on_the_motorway(scans: list[Scan], lag: float | None) -> tuple[Detector, Stream, list[int]]:
+    """The detector after all of them, and what a smoother says, or without a lag the detector."""
+    detector = Detector(MOTORWAY, capacity=8)
+    smoother = detector.history = None if lag is None else FixedLagSmoother(MOTORWAY, lag)
+    said: Stream = []
+    when: list[int] = []
+    for scan in scans:
+        n = detector.step(scan.t_ns, scan)
+        answers = (
+            [(scan.t_ns, detector.reports[:n])] if smoother is None else smoother.due(scan.t_ns)
+        )
+        for at, reports in answers:
+            said.append((at, reports.copy()))
+            when.append(scan.t_ns)
+    if smoother is not None:
+        for at, reports in smoother.finish():
+            said.append((at, reports.copy()))
+            when.append(-1)
+    return detector, said, when
+
+
+def share(report: Any) -> float:
+    """Of lane changes in what is in our direction."""
+    p = report["p"]
+    return float(p[Manoeuvre.LANE_CHANGE] / (1.0 - p[Manoeuvre.STATIONARY] - p[Manoeuvre.ONCOMING]))
+
+
+def test_scans_of_nothing() -> None:
+    scans = motorway(2.0)
+    for scan in (*scans[:3], *scans[10:13]):
+        scan.n = 0
+    _, said, _ = on_the_motorway(scans, 0.3)
+    assert [len(reports) for _, reports in said[:4]] == [0, 0, 0, 3]
+    assert len(said) == len(scans)
+
+
+@pytest.mark.parametrize("lag", [0.05, 0.5, 1.2])
+def test_a_lag_knows_of_lane_changes_what_the_filter_knows_then(lag: float) -> None:
+    """By the drive until then: another detector that is asked about the past."""
+    scans = motorway(8.0)
+    _, said, when = on_the_motorway(scans, lag)
+    probed = 0
+    for k in range(15, 66, 4):
+        at, reports = said[k]
+        cut = [scan for scan in scans if scan.t_ns <= when[k]]
+        detector, _, _ = on_the_motorway(cut, None)
+        assert detector.road is not None
+        for report in reports:
+            (slot,) = np.flatnonzero(detector._id == report["object_id"])
+            expected = detector.road.changing(at * 1e-9)[slot]
+            assert share(report) == pytest.approx(sum(expected), abs=1e-6)
+            if report["manoeuvre"] == Manoeuvre.LANE_CHANGE:
+                assert report["direction"] == (1 if expected[0] > expected[1] else -1)
+                probed += 1
+    assert probed > 5
+
+
+def onset(stream: Stream) -> float:
+    """When the lane change of object 3 began [s]."""
+    return min(t_ns * 1e-9 for t_ns, r in stream for one in r if one["object_id"] == 3
+               and one["manoeuvre"] == Manoeuvre.LANE_CHANGE)  # fmt: skip
+
+
+def test_with_a_lag_a_lane_change_is_said_to_have_begun_when_it_did() -> None:
+    scans = motorway(8.0)
+    causal, lagged = (on_the_motorway(scans, lag)[1] for lag in (None, 1.0))
+    assert onset(causal) > onset(lagged) + 0.2
+    assert onset(lagged) == pytest.approx(TURN_S, abs=0.4)
+
+
+def test_a_long_lag_does_not_forget_lane_changes() -> None:
+    """The filter does, some time after they have ended."""
+    scans = motorway(14.0)
+    settle = float(MOTORWAY.road[P_SETTLE]) if MOTORWAY.road is not None else 0.0
+    short, long = (of(on_the_motorway(scans, lag)[1], 3) for lag in (settle, 6.0))
+    assert sum(share(report) for report in short) > 30.0
+    assert [share(r) for r in long] == pytest.approx([share(r) for r in short], abs=0.02)
+
+
+@pytest.mark.parametrize("reused", [False, True])
+@pytest.mark.parametrize("unseen", [False, True])
+def test_what_is_pending_when_a_track_ends(reused: bool, unseen: bool) -> None:
+    """It is what was known then, and nothing of another object's that has the slot at once."""
+    end = 34
+    scans, whole = motorway(6.0), motorway(6.0)
+    for scan in scans[end:]:
+        if reused:
+            scan.new[2] = scan is scans[end]
+            scan.z[2] = 60.0, 0.0, 0.0, 0.0
+        else:
+            scan.n = 2
+    # where it is is not known at last
+    for one in (scans, whole):
+        one[end - 1].valid[2, 2] = not unseen
+    _, said, _ = on_the_motorway(scans, 1.0)
+    last, _, _ = on_the_motorway(whole[:end], None)
+    assert last.road is not None
+    (slot,) = np.flatnonzero(last._id == 3)
+    for at, reports in said[end - 9 : end]:
+        (report,) = reports[reports["object_id"] == 3]
+        expected = sum(last.road.changing(at * 1e-9)[slot])
+        assert share(report) == pytest.approx(expected, abs=1e-6)
+    assert share(report) > 0.8
+    _, reports = said[end + 3]
+    assert (share(reports[reports["object_id"] == 3][0]) < 0.5) == reused

@@ -25,7 +25,6 @@ from can_imm.estimation.lane_changes import (
     N_LANES,
     STEADY_TIME,
     UNKNOWN,
-    Four,
     add_logs,
     correct,
     course,
@@ -76,6 +75,7 @@ LONGEST_S = 1.0
 
 CHANGES_DTYPE = np.dtype(
     [
+        ("since", np.float64),
         ("t", np.float64),
         ("begun", np.float64),
         ("cov", np.float64, (3,)),
@@ -105,18 +105,18 @@ CHANGES_DTYPE = np.dtype(
     ],
     align=True,
 )
-"""What is thought of one vehicle: ``t`` time of its last measurement [s], NaN before the first one;
-``begun`` when courses began last; ``cov`` covariance of place and rate beside the course (P00, P01,
-P11).  By lane (0 to `N_LANES` - 1, `EDGE` the ego's): log weight of keeping it, place and rate [m,
-m/s].  ``kept``: the lane that it keeps, -1 while that is not sure; by level of wander: log
-``evidence`` for it, and covariance, place and rate if it were the true one.  The first ``n``
-courses that may be under way: see `lane_changes.COURSE_DTYPE`. """
+"""What is thought of one vehicle: ``since`` and ``t``, times of its first and its last measurement
+[s], NaN before; ``begun`` when courses began last; ``cov`` covariance of place and rate beside the
+course (P00, P01, P11).  By lane (0 to `N_LANES` - 1, `EDGE` the ego's): log weight of keeping it,
+place and rate [m, m/s].  ``kept``: the lane that it keeps, -1 while that is not sure; by level of
+wander: log ``evidence`` for it, and covariance, place and rate if it were the true one.  The first
+``n`` courses that may be under way: see `lane_changes.COURSE_DTYPE`. """
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def forget_changes_(one: Any) -> None:  # pragma: no cover - compiled
     """Nothing is known of the vehicle."""
-    one.t = np.nan
+    one.since = one.t = np.nan
     one.n = 0
     one.kept = -1
     one.evidence[:] = 0.0
@@ -184,6 +184,7 @@ def follow_(
     if not dt <= LONGEST_S:
         forget_changes_(one)
         begin_courses_(one, t, y, width, par)
+        one.since = t
         one.log_w[:] = 0.0
         one.place[:] = 0.0
         one.rate[:] = 0.0
@@ -239,7 +240,7 @@ def follow_(
             one.log_w[lane] -= 0.5 * lost
             best = max(best, one.log_w[lane])
     give_up_(one, best)
-    left, right, _, _ = look(one, t)
+    left, right = probabilities(one, t)
     if left + right > CALM or not r < UNKNOWN:
         one.kept = -1
     else:
@@ -280,10 +281,15 @@ def learn_wander_(
     Args:
         dt: since the measurement before it [s].
     """
-    lane = 0
+    # a course that has come to its end is a lane that is kept, too
+    w = np.zeros(N_LANES)
     for other in range(N_LANES):
-        if one.log_w[other] > one.log_w[lane]:
-            lane = other
+        w[other] = math.exp(one.log_w[other])
+    for q in range(one.n):
+        c = one.course[q]
+        if one.t - c.start >= c.duration:
+            w[c.lane + c.turn] += math.exp(c.log_w)
+    lane = np.argmax(w)
     begins = lane != one.kept
     one.kept = lane
     off = y - (lane - EDGE) * width
@@ -340,28 +346,23 @@ def tell_changes_(
         changes: (capacity,) of `CHANGES_DTYPE`, by slot.
         ids: (capacity,) object id of each slot, -1 for a free one.
         t: [s], not longer ago than the time to settle.
-        p: (N, 4) written for each slot in use, in their order, see `look`.
+        p: (N, 2) written for each slot in use, in their order: changing to the left, to the right;
+            NaN where nothing was known then.
     """
     row = 0
     for s in range(ids.shape[0]):
         if ids[s] < 0:
             continue
-        p[row, 0], p[row, 1], p[row, 2], p[row, 3] = look(changes[s], t)
+        p[row, 0], p[row, 1] = probabilities(changes[s], t)
         row += 1
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def look(one: Any, t: float) -> Four:  # pragma: no cover - compiled
-    """Whether a vehicle was changing lanes at time t [s].
-
-    Returns:
-        Probability that it was, to the left and to the right, NaN if nothing is known; mean begin
-        and end [s] of the change that is under way or has just ended, NaN if probably none.
-    """
-    if one.t != one.t:
-        return np.nan, np.nan, np.nan, np.nan
+def probabilities(one: Any, t: float) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Of a change to the left and to the right at time t [s]; NaN if nothing was known then."""
+    if not t >= one.since:
+        return np.nan, np.nan
     left = right = keep = 0.0
-    weight, begin, end = np.zeros(2), np.zeros(2), np.zeros(2)
     for lane in range(N_LANES):
         keep += math.exp(one.log_w[lane])
     for q in range(one.n):
@@ -373,16 +374,48 @@ def look(one: Any, t: float) -> Four:  # pragma: no cover - compiled
             left += w
         else:
             right += w
-        side = 0 if c.turn > 0 else 1
-        weight[side] += w
-        begin[side] += w * (c.start - t)
-        end[side] += w * (c.start - t + c.duration)
     total = left + right + keep
-    side = 0 if weight[0] > weight[1] else 1
-    if weight[side] < 0.5 * total:
-        return left / total, right / total, np.nan, np.nan
-    w = weight[side]
-    return left / total, right / total, t + begin[side] / w, t + end[side] / w
+    return left / total, right / total
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def tell_times_(changes: Any, ids: Any, reports: Any) -> None:  # pragma: no cover - compiled
+    """When the lane changes that are under way or have just ended began and end: ``change`` of the
+    reports of all slots in use, in their order; NaN where there is probably none.
+
+    Args:
+        changes: (capacity,) of `CHANGES_DTYPE`, by slot.
+        ids: (capacity,) object id of each slot, -1 for a free one.
+        reports: (N,) of `REPORT_DTYPE`.
+    """
+    row = 0
+    weight, begin, end = np.zeros(2), np.zeros(2), np.zeros(2)
+    for s in range(ids.shape[0]):
+        if ids[s] < 0:
+            continue
+        report, one = reports[row], changes[s]
+        row += 1
+        report.change[0] = report.change[1] = np.nan
+        if one.t != one.t:
+            continue
+        weight[:] = 0.0
+        begin[:] = 0.0
+        end[:] = 0.0
+        total = 0.0
+        for lane in range(N_LANES):
+            total += math.exp(one.log_w[lane])
+        for q in range(one.n):
+            c = one.course[q]
+            w = math.exp(c.log_w)
+            side = 0 if c.turn > 0 else 1
+            weight[side] += w
+            begin[side] += w * (c.start - one.t)
+            end[side] += w * (c.start - one.t + c.duration)
+            total += w
+        side = 0 if weight[0] > weight[1] else 1
+        if weight[side] > 0.5 * total:
+            report.change[0] = one.t + begin[side] / weight[side]
+            report.change[1] = one.t + end[side] / weight[side]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -413,7 +446,8 @@ def follow_all_(
     """
     h = np.zeros(road.shape[0] + 1)
     for s in range(changes.shape[0]):
-        if notes[s].new or notes[s].off > OFF:
+        # what was noted of one that was not seen is old
+        if notes[s].new or (notes[s].seen and notes[s].off > OFF):
             forget_changes_(changes[s])
     for k in range(n):
         s = slot[k]
@@ -461,3 +495,6 @@ def shift_changes_(changes: Any, moved: int) -> None:  # pragma: no cover - comp
                     one.course[kept] = c
                 kept += 1
         one.n = kept
+        if kept == 0 and np.max(one.log_w) == -np.inf:
+            # it was in none of the lanes that are left
+            forget_changes_(one)

@@ -18,7 +18,7 @@ WIDTH, BESIDE = 3.5, 0.3
 def way(u: FloatArray) -> FloatArray:
     """Share of the way done at the share u of the time."""
     u = np.clip(u, 0.0, 1.0)
-    return 0.5 * (6 * u**5 - 15 * u**4 + 10 * u**3) + 0.25 * (1.0 - np.cos(np.pi * u))
+    return 0.5 * (6 * u**5 - 15 * u**4 + 10 * u**3) + 0.5 * (3 * u**2 - 2 * u**3)
 
 
 def covariance(t: FloatArray) -> FloatArray:
