@@ -51,6 +51,8 @@ class RoadFrame:
             without the guides.
         speed, yaw_rate, acceleration: of the ego at the last scan [m/s, rad/s, m/s²], NaN where
             unknown.
+        doubtful: lateral speeds were measured in the last scan, and the ego's motion is known: lane
+            changes are to be doubted by them, see `reporting.doubt_`.
     """
 
     def __init__(self, par: FloatArray) -> None:
@@ -70,6 +72,7 @@ class RoadFrame:
         self.yaw_rate = math.nan
         self.acceleration = math.nan
         self._pace, self._pace_cov = np.zeros(2), np.zeros((2, 2))
+        self.doubtful = False
         self._h = np.zeros(road.N_ROAD + 1)
 
     @property
@@ -96,6 +99,7 @@ class RoadFrame:
             other.move(t_ns, 20.0, 0.0)
             other.localise_(scan, scan.z, scan.std)
             other.watch_(bank, objects, scan, slot, status, age)
+            other.doubtful = True
             other.judge_(ids, memory, reports, t_ns)
             other.globalise_(reports, 0)
         for x, P in ((other.x, other.P), (other._past, other._P_past)):
@@ -173,7 +177,9 @@ class RoadFrame:
             self._notes[last], bank.record, objects, scan.n, slot, status, age,
             scan.z, r, scan.valid, scan.angle,
         )  # fmt: skip
-        self._learn(bool(scan.valid[: scan.n, VY].any()))
+        measured = bool(scan.valid[: scan.n, VY].any())
+        self.doubtful = measured and not math.isnan(self.speed)
+        self._learn(measured)
         moved = 0
         if abs(self.x[road.OFFSET]) > 0.5 * self.width:
             moved = 1 if self.x[road.OFFSET] > 0.0 else -1
@@ -225,9 +231,10 @@ class RoadFrame:
         tell_changes_(self._changes, ids, t_ns * 1e-9, self._p)
         judge_changes_(self._p, reports, n)
         tell_times_(self._changes, ids, reports)
-        if not math.isnan(self.speed):
+        if self.doubtful:
             doubtful = self._par[road.P_DOUBTFUL]
             doubt_(self.x, self.P, doubtful, self.speed, self._h, ids, memory, reports)
+        if not math.isnan(self.acceleration):
             judge_ramps_(self.acceleration, reports, n)
 
     def changing(self, t: float) -> FloatArray:

@@ -85,6 +85,7 @@ class _Scan:
             tracks' first.
         moved: lanes that the ego moved to the left.
         road, road_cov: state and covariance of the road, None and empty without one.
+        doubtful: see `RoadFrame`.
         ego_speed, acceleration: of the ego [m/s, m/s²], NaN where unknown.
         changes: (n, 2) for `reporting.judge_changes_`.
     """
@@ -97,6 +98,7 @@ class _Scan:
     moved: int
     road: FloatArray | None = None
     road_cov: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    doubtful: bool = False
     ego_speed: float = math.nan
     acceleration: float = math.nan
     changes: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
@@ -153,6 +155,7 @@ class _Smoother:
             self._shift += moved * road.width
             noted.road, noted.road_cov = road.x.copy(), road.P.copy()
             noted.ego_speed, noted.acceleration = road.speed, road.acceleration
+            noted.doubtful = road.doubtful
             if self._hindsight is not None:
                 number = self._hindsight.add(now, road, self._shift)
         self._grow_slots(len(ids))
@@ -232,11 +235,12 @@ class _Smoother:
             self._ids[scan.slots] = reports["object_id"]
             if self._road is not None:
                 judge_changes_(scan.changes, reports, n)
-                if not math.isnan(scan.ego_speed):
+                if scan.doubtful:
                     doubt_(
                         scan.road, scan.road_cov, self._road[P_DOUBTFUL], scan.ego_speed,
                         self._h, self._ids, self._memory, reports,
                     )  # fmt: skip
+                if not math.isnan(scan.acceleration):
                     judge_ramps_(scan.acceleration, reports, n)
                 hesitate_(self._ids, self._memory, self._road[P_SURE], reports, n)
             relate_(self._ids, self._memory, reports, n)
