@@ -53,7 +53,7 @@ from can_imm.types import FloatArray
 
 N_COURSES = 1024
 """Most courses that are followed of one vehicle."""
-APART = 0.12
+APART = 0.06
 """Courses begin so long one after the other [s]."""
 IMPOSSIBLE = 12.0
 """A course whose log weight is so much lower than that of the best one is given up."""
