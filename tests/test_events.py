@@ -36,6 +36,7 @@ class Stream:
     def scan(self, *said: dict[str, Any]) -> None:
         """One report per dictionary of fields; ``id`` and ``m`` for object and manoeuvre."""
         reports = np.zeros(len(said), REPORT_DTYPE)
+        reports["change"] = np.nan
         reports["duplicate_of"] = -1
         reports["ego_speed"] = np.nan
         for row, fields in zip(reports, said, strict=True):

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from small_roads import KEEP, LEFT, Traffic, parameters
 
 from can_imm.estimation import guides, road
+from can_imm.relations import MEMORY_DTYPE
 from can_imm.reporting import judge_changes_
 from can_imm.road import LONGEST_S, SCANS, RoadFrame
 from can_imm.types import REPORT_DTYPE, Manoeuvre, Scan
@@ -443,7 +444,7 @@ def test_vehicles_are_followed_in_the_axes_of_the_road(side: int, angle: float) 
         )  # fmt: skip
         reports["p"] = 0.0
         reports["p"][:, [KL, LC]] = 0.5
-        traffic.frame.judge_changes_(ids, reports, traffic.t_ns)
+        traffic.frame.judge_(ids, np.zeros(len(ids), MEMORY_DTYPE), reports, traffic.t_ns)
         said.append(reports[:5].copy())
     p = np.array(said)["p"][:, :, LC]
     keepers = [0, 1, 3, 4]

@@ -55,7 +55,7 @@ N_COURSES = 1024
 """Most courses that are followed of one vehicle."""
 APART = 0.06
 """Courses begin so long one after the other [s]."""
-IMPOSSIBLE = 12.0
+IMPOSSIBLE = 14.0
 """A course whose log weight is so much lower than that of the best one is given up."""
 OUTLIER = 39.0
 """Squared normalised error of a measurement counts as this at most."""
@@ -68,6 +68,9 @@ CALM = 0.16
 """A vehicle that is less likely to change lanes shows how it wanders."""
 SURPRISE = 9.0
 """Squared normalised error of a measurement counts as this at most for how a vehicle wanders."""
+ROAD_ERROR = 1.0
+"""Variance that counts at most of where the road is thought to be [m²]: however little is known of
+the lanes far ahead, a vehicle that does not move across them does not change them."""
 OFF = 0.99
 """An object that is not in our direction with a higher probability changes no lanes."""
 LONGEST_S = 1.0
@@ -463,7 +466,7 @@ def follow_all_(
             rv = r[k, 3] * cos * cos + r[k, 1] * sin * sin
         to_lane, to_speed = place(road, h, x, vx, speed)
         lane_row_(h, road[WAY], x)
-        road_error = par[P_BESIDE_ERROR] * variance(P, h)
+        road_error = min(par[P_BESIDE_ERROR] * variance(P, h), ROAD_ERROR)
         if speed == speed:
             slope_row_(h, road[WAY], x)
             rv += par[P_BESIDE_SPEED_ERROR] * variance(P, h) * (speed + vx) ** 2

@@ -31,6 +31,7 @@ def test_seconds_are_exact(t_ns, text):
 
 def reports(*said: dict[str, object]) -> np.ndarray:
     rows = np.zeros(len(said), REPORT_DTYPE)
+    rows["change"] = np.nan
     rows["duplicate_of"] = -1
     for row, fields in zip(rows, said, strict=True):
         for name, value in fields.items():
