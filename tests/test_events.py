@@ -88,6 +88,35 @@ def test_a_lane_change_with_everything_that_is_known_of_it():
     assert event.middle_ns == 950 * MS
 
 
+def test_a_lane_change_lasts_from_when_it_began_to_when_it_ended_as_far_as_that_is_told():
+    """By what was told of it at last, and not beyond what was seen of the object."""
+    s = Stream()
+    s.scans(10, {"m": KL, "lane": 0})
+    s.scans(10, {"m": LC, "direction": 1, "lane": 0, "change": (0.8, 4.0)})
+    s.scans(10, {"m": LC, "direction": 1, "lane": 1, "change": (0.3, 3.5)})
+    s.scans(3, {"m": KL, "lane": 1, "change": (0.4, 2.85)})
+    s.scans(2, {"m": KL, "lane": 1})
+    s.scans(10, {"m": KL, "lane": 1, "change": (9.0, 9.5)})  # another one, later
+    (event,) = s.found()
+    assert (event.from_ns, event.to_ns) == (400 * MS, 2850 * MS)
+    assert (event.gap, event.lane_from, event.lane_to) == (50.0, 0, 1)
+
+
+def test_a_lane_change_does_not_last_beyond_its_object():
+    s = Stream()
+    s.scans(2, {"m": KL, "id": 2})
+    s.scans(8, {"m": LC, "direction": -1, "change": (-1.0, 7.0)})
+    (event,) = s.found()
+    assert (event.from_ns, event.to_ns) == (200 * MS, 900 * MS)
+
+
+def test_other_events_do_not_last_as_long_as_a_lane_change():
+    s = Stream()
+    s.scans(5, {"m": M.APPROACHING, "change": (-1.0, 7.0)})
+    (event,) = s.found()
+    assert (event.from_ns, event.to_ns) == (0, 400 * MS)
+
+
 def test_the_lane_before_is_that_of_half_a_second_before():
     s = Stream()
     s.scans(8, {"m": KL, "lane": 0})

@@ -8,13 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filterpy.common import Q_continuous_white_noise
+from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import norm
 from small_roads import KEEP, LEFT, Traffic, parameters
 
 from can_imm.estimation import guides, road
 from can_imm.relations import MEMORY_DTYPE
-from can_imm.reporting import judge_changes_
+from can_imm.reporting import WANDER_SPEED, doubt_, judge_changes_, judge_ramps_
 from can_imm.road import LONGEST_S, SCANS, RoadFrame
 from can_imm.types import REPORT_DTYPE, Manoeuvre, Scan
 
@@ -460,3 +463,145 @@ def test_vehicles_are_followed_in_the_axes_of_the_road(side: int, angle: float) 
     assert np.nanmax(then[[0, 1, 4, 5]]) < 0.1
     assert np.isnan(then[2]).all(), "nobody is there"
     assert np.isnan(traffic.frame.changing(0.05)).all(), "before the first scan"
+
+
+# ---- how far the road is known
+
+
+def doubted(frame: RoadFrame, ids: Any, memory: Any, reports: Any) -> None:
+    doubt_(frame.x, frame.P, 0.5, 30.0, np.zeros(road.N_ROAD + 1), ids, memory, reports)
+
+
+def lane_changes(p: float) -> np.ndarray[Any, Any]:
+    """At 20 to 150 m, as fast as the ego but for the second and the third."""
+    reports = np.zeros(4, REPORT_DTYPE)
+    reports["x"] = [(20, 0.5, 0, 1.8), (90, -2, 0, -0.9), (90, 2, 0, 0.9), (150, 0, 0, 0.05)]
+    reports["p"][:, LC], reports["p"][:, KL] = p, 1.0 - p
+    reports["manoeuvre"], reports["second"], reports["direction"] = LC, KL, -1
+    return reports
+
+
+@pytest.mark.parametrize("way", [0.0, 20.0])
+def test_lane_changes_are_trusted_no_further_than_the_road_is_known(way: float) -> None:
+    """A road that bends unseen explains a lateral speed by the uncertainty of its direction, and
+    that times the vehicle's speed; of the direction by quadrature of the bends."""
+    frame = driven(3.0).frame
+    frame.x[road.WAY] = way
+    frame.P /= 25.0
+    reports = lane_changes(0.8)
+    doubted(frame, np.arange(4, dtype=np.int32), np.zeros(4, MEMORY_DTYPE), reports)
+    knots = road.SPACING * np.arange(road.N_KNOTS)
+    shares = []
+    for x, vx, _, vy in lane_changes(0.8)["x"].tolist():
+        u = way + (np.arange(20000) + 0.5) * x / 20000
+        h = np.zeros(road.N_ROAD)
+        h[[road.HEADING, road.MOUNTING]] = -1.0
+        for i in range(road.N_KNOTS):
+            h[road.KNOT + i] = np.interp(u, knots, np.eye(road.N_KNOTS)[i]).mean() * x
+        std = math.hypot(WANDER_SPEED, (30.0 + vx) * math.sqrt(h @ frame.P @ h))
+        shares.append(1.0 / (1.0 + 0.5 * math.sqrt(2.0 * math.pi) * norm.pdf(vy, 0.0, std)))
+    assert shares[0] > 0.9
+    assert shares[3] < 0.7
+    rest = [KL, int(Manoeuvre.APPROACHING), int(Manoeuvre.RECEDING), KL]
+    expected = np.zeros_like(reports["p"])
+    expected[:, KL] = 0.2
+    expected[np.arange(4), rest] += 0.8 * (1.0 - np.array(shares))
+    expected[:, LC] = 0.8 * np.array(shares)
+    np.testing.assert_allclose(reports["p"], expected, rtol=1e-4, atol=1e-9)
+    np.testing.assert_array_equal(reports["manoeuvre"], expected[:, 1:].argmax(axis=1) + 1)
+    assert (reports["direction"] == np.where(reports["manoeuvre"] == LC, -1, 0)).all()
+    assert len(set(reports["manoeuvre"].tolist())) > 1, "some were doubted away, some not"
+
+
+def test_what_is_hardly_a_lane_change_and_what_nobody_is_in_is_not_doubted() -> None:
+    frame = driven(3.0).frame
+    for p, first in ((0.009, 0), (0.8, FREE)):
+        reports = lane_changes(p)
+        ids = np.full(4, first, np.int32)
+        doubted(frame, ids, np.zeros(4, MEMORY_DTYPE), reports)
+        np.testing.assert_array_equal(reports, lane_changes(p))
+
+
+def test_a_lane_change_that_was_trusted_stays_so_until_it_is_over() -> None:
+    """It ends slowly, and then looks like a bend; another one is to be trusted anew."""
+    frame = driven(3.0).frame
+    ids, memory = np.array([FREE, 7], np.int32), np.zeros(2, MEMORY_DTYPE)
+
+    def trusted(vy: float, p: float = 0.8) -> float:
+        reports = lane_changes(p)[:1]
+        reports["x"][0, 3], reports["age"] = vy, 5
+        doubted(frame, ids, memory, reports)
+        return float(reports["p"][0, LC] / p)
+
+    at_first = trusted(0.05)
+    assert at_first < 0.5
+    fast = trusted(1.8)
+    assert fast > 0.9
+    assert trusted(0.05) == pytest.approx(fast)
+    trusted(0.05, p=0.1)
+    assert trusted(0.05) == pytest.approx(at_first)
+
+
+@pytest.mark.parametrize(("speeds", "speed"), [(True, 30.0), (False, 30.0), (True, NAN)])
+def test_only_measured_lateral_speeds_on_a_known_road_give_rise_to_doubt(
+    speeds: bool, speed: float
+) -> None:
+    traffic = Traffic(parameters())
+    for k in range(5):
+        traffic.scan([0], np.array([[60.0 - k, 0.0]]), speed=speed, yaw_rate=0.0, speeds=speeds)
+    assert traffic.frame.doubtful == (speeds and speed == 30.0)
+
+
+# ---- the ego changes its speed
+
+
+def test_the_egos_acceleration_is_that_of_a_kalman_filter() -> None:
+    rng = np.random.default_rng(5)
+    frame, kf = RoadFrame(parameters()), KalmanFilter(2, 1)
+    times = np.cumsum(rng.uniform(0.03, 0.1, 80))
+    kf.x, kf.P, kf.R[:] = np.array([[20.0], [0.0]]), np.diag([0.06**2, 0.3**2]), 0.06**2
+    kf.H[:] = 1.0, 0.0
+    frame.move(0, 20.0, 0.0)
+    assert frame.acceleration == 0.0
+    before = 0
+    for t in times.tolist():
+        t_ns = round(t * 1e9)
+        dt = (t_ns - before) * 1e-9
+        before = t_ns
+        speed = 20.0 + 0.8 * max(t - 2.0, 0.0) + rng.normal(0.0, 0.06)
+        frame.move(t_ns, speed, 0.0)
+        kf.F = np.array([[1.0, dt], [0.0, 1.0]])
+        kf.Q = Q_continuous_white_noise(2, dt, 0.3)
+        kf.predict()
+        kf.update(speed)
+        assert frame.acceleration == pytest.approx(kf.x[1, 0], abs=1e-9)
+    assert frame.acceleration == pytest.approx(0.8, abs=0.25)
+    frame.move(before + S // 10, NAN, 0.0)
+    assert math.isnan(frame.acceleration)
+    frame.move(before + S // 5, 23.0, 0.0)
+    assert frame.acceleration == 0.0
+
+
+@pytest.mark.parametrize("slower", [True, False])
+def test_who_keeps_their_speed_approaches_as_soon_as_the_ego_is_faster(slower: bool) -> None:
+    a, (to, other) = 0.7, (Manoeuvre.APPROACHING, Manoeuvre.RECEDING)
+    if slower:
+        a, to, other = -a, other, to
+    reports = np.zeros(5, REPORT_DTYPE)
+    reports["x"][:, 1] = np.array([-0.3, 0.0, 0.3, -0.3, 0.0]) * np.sign(a)
+    reports["p"][:, KL], reports["p"][:, LC] = 0.9, 0.1
+    reports["p"][3] = np.eye(len(Manoeuvre))[LC]
+    reports["manoeuvre"] = KL
+    before = reports["p"].copy()
+    judge_ramps_(a, reports, 4)
+    np.testing.assert_allclose(reports["p"].sum(axis=1), before.sum(axis=1), rtol=1e-12)
+    share = reports["p"][:3, to] / 0.9
+    assert share[0] > 0.8, "it is slower already"
+    assert share[0] > share[1] > share[2]
+    assert share[2] < 0.2, "it goes along"
+    np.testing.assert_array_equal(reports["p"][:, other], before[:, other])
+    np.testing.assert_array_equal(reports["p"][3:], before[3:], "keeps no lane; beyond n")
+    assert reports["manoeuvre"][:4].tolist() == [to, to if share[1] > 0.5 else KL, KL, LC]
+    calm = reports.copy()
+    judge_ramps_(0.05 * a, calm, 3)
+    np.testing.assert_allclose(calm["p"], reports["p"], atol=0.01)

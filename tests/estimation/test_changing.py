@@ -17,7 +17,7 @@ from can_imm.estimation import changing as ch
 from can_imm.estimation import lane_changes as lc
 from can_imm.estimation import road
 from can_imm.estimation.guides import NOTE_DTYPE
-from can_imm.types import FloatArray
+from can_imm.types import REPORT_DTYPE, FloatArray
 
 WIDTH, HURRY, RATE, STEADY = 3.5, 0.5, 0.03, 0.1
 LEVEL, ROAD_ERROR = 0.25, 0.02
@@ -621,3 +621,31 @@ def test_measured_in_turned_axes() -> None:
         other.scan({0: 0.1 * k, 1: 0.0}, 1.0, angle=0.3)
     assert one.tell()[0, 0] > 0.5
     np.testing.assert_allclose(one.tell(), other.tell(), atol=1e-9)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_when_a_lane_change_began_and_ended(side: int) -> None:
+    """Better and better while it lasts, and some time after it; nothing is told of who keeps."""
+    rng = np.random.default_rng(8)
+    slots = np.zeros(3, ch.CHANGES_DTYPE)
+    slots["since"] = slots["t"] = np.nan
+    reports = np.zeros(2, REPORT_DTYPE)
+    ids = np.array([4, -1, 6], np.int32)
+    par, told = one_level(settle=1.5), []
+    for t in np.arange(0.0, 12.0, 0.07).tolist():
+        u = min(max((t - 3.0) / 4.0, 0.0), 1.0)
+        for slot, done in ((0, 0.0), (2, u)):
+            slope = 6.0 * u * (1.0 - u) / 4.0 * WIDTH if slot else 0.0
+            y = side * WIDTH * done * done * (3.0 - 2.0 * done) + STD * rng.standard_normal()
+            follow(slots[slot], par, t, y, side * slope + SPEED_STD * rng.standard_normal())
+        ch.tell_times_(slots, ids, reports)
+        told.append((t, *reports["change"].ravel().tolist()))
+    t, keeps_from, keeps_to, begin, end = np.array(told).T
+    assert np.isnan(keeps_from).all()
+    assert np.isnan(keeps_to).all()
+    assert np.isnan(begin[(t < 2.9) | (t > 10.0)]).all()
+    during, after = (t > 5.0) & (t < 7.0), (t > 7.3) & (t < 8.0)
+    assert abs(begin[during] - 3.0).max() < 0.6
+    assert (end[during] > t[during]).all()
+    assert abs(begin[after] - 3.0).max() < 0.4
+    assert abs(end[after] - 7.0).max() < 0.4
