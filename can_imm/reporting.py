@@ -195,6 +195,14 @@ def globalise_(road: FloatArray, h: FloatArray, reports: Any, n: int, speed: flo
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def by_speed(vx: float) -> int:
+    """What an object does that changes no lanes, by its relative speed [m/s]."""
+    if not abs(vx) > STEADY:
+        return _KEEP_LANE
+    return _RECEDING if vx > 0.0 else _APPROACHING
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def judge_changes_(p: FloatArray, reports: Any, n: int) -> None:
     """Say of the first n reports whether they change lanes, in place.
 
@@ -220,13 +228,10 @@ def judge_changes_(p: FloatArray, reports: Any, n: int) -> None:
                 if i != _STATIONARY and i != _ONCOMING and i != _LANE_CHANGE:
                     report.p[i] *= ours * (1.0 - change) / others
         else:
-            other = _KEEP_LANE
-            if abs(report.x[1]) > STEADY:
-                other = _RECEDING if report.x[1] > 0.0 else _APPROACHING
             for i in range(1, report.p.shape[0]):
                 if i != _STATIONARY and i != _ONCOMING:
                     report.p[i] = 0.0
-            report.p[other] = ours * (1.0 - change)
+            report.p[by_speed(report.x[1])] = ours * (1.0 - change)
         report.p[_LANE_CHANGE] = ours * change
         report.direction = 0
         if decide_(report) == _LANE_CHANGE:
@@ -300,10 +305,7 @@ def doubt_(
         kept = doubtful * math.exp(-0.5 * report.x[3] ** 2 / s2) / math.sqrt(s2)
         share = max(1.0 / (1.0 + kept), memory[s].trust)
         memory[s].trust = share
-        other = _KEEP_LANE
-        if abs(report.x[1]) > STEADY:
-            other = _RECEDING if report.x[1] > 0.0 else _APPROACHING
         report.p[_LANE_CHANGE] = share * p
-        report.p[other] += (1.0 - share) * p
+        report.p[by_speed(report.x[1])] += (1.0 - share) * p
         if decide_(report) != _LANE_CHANGE:
             report.direction = 0

@@ -192,6 +192,10 @@ class _Smoother:
             if self._shift != 0.0:
                 rows.x[k, :, Y] += self._shift
         self._pending.append(noted)
+        self._noted(noted, road)
+
+    def _noted(self, scan: _Scan, road: RoadFrame | None) -> None:
+        """A scan has been written down: it is the last of the pending ones."""
 
     def _take_rows(self) -> Rows:
         return self._free.pop() if self._free else Rows(64, *self._shape)
@@ -270,26 +274,13 @@ class FixedIntervalSmoother(_Smoother):
         self._look_ahead = int(LOOK_AHEAD_S * 1e9) // bank.step_ns
         self._ended: deque[tuple[int, _Track]] = deque()
 
-    def scan(
-        self,
-        now: int,
-        objects: Any,
-        ids: IntArray,
-        measured: BoolArray,
-        reports: Reports,
-        road: RoadFrame | None,
-        moved: int,
-        scan: Scan,
-        slot: IntArray,
-    ) -> None:
-        """Write a scan down; see `detector.History`."""
-        super().scan(now, objects, ids, measured, reports, road, moved, scan, slot)
-        self._now = now
-        for track in self._pending[-1].tracks:
+    def _noted(self, scan: _Scan, road: RoadFrame | None) -> None:
+        self._now = scan.now
+        for track in scan.tracks:
             if track.rows.n >= track.told + BLOCK:
                 last = track.told + BLOCK - OVERLAP
                 self._release(track, track.rows.measured_before(last))
-        while self._ended and self._ended[0][0] <= now:
+        while self._ended and self._ended[0][0] <= self._now:
             self._release_ended()
         if self._hindsight is not None:
             tracks = [*self._tracks.values(), *(track for _, track in self._ended)]
@@ -367,26 +358,12 @@ class FixedLagSmoother(_Smoother):
         self._road = bank.road
         self._settle = math.inf if bank.road is None else float(bank.road[P_SETTLE])
 
-    def scan(
-        self,
-        now: int,
-        objects: Any,
-        ids: IntArray,
-        measured: BoolArray,
-        reports: Reports,
-        road: RoadFrame | None,
-        moved: int,
-        scan: Scan,
-        slot: IntArray,
-    ) -> None:
-        """Write a scan down; see `detector.History`."""
-        super().scan(now, objects, ids, measured, reports, road, moved, scan, slot)
+    def _noted(self, scan: _Scan, road: RoadFrame | None) -> None:
         if road is None or self._road is None:
             return
-        noted = self._pending[-1]
-        noted.changes = np.full((len(noted.slots), 2), np.nan)
+        scan.changes = np.full((len(scan.slots), 2), np.nan)
         for earlier in reversed(self._pending):
-            if noted.t - earlier.t > self._settle:
+            if scan.t - earlier.t > self._settle:
                 break
             self._look_back(earlier, road)
 

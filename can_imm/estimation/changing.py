@@ -17,21 +17,21 @@ from typing import Any
 import numba
 import numpy as np
 
-from can_imm.estimation.guides import position
 from can_imm.estimation.lane_changes import (
     EDGE,
+    LASTS,
+    LOG_P,
     N_BEGUN,
     N_DURATIONS,
     N_LANES,
-    STEADY_TIME,
     UNKNOWN,
     add_logs,
+    carried,
     correct,
     course,
     fading,
     gains,
     spread,
-    usual_durations,
 )
 from can_imm.estimation.road import (
     P_BESIDE_ERROR,
@@ -42,12 +42,8 @@ from can_imm.estimation.road import (
     P_CHANGE_RATE,
     P_CHANGE_STEADY,
     P_SETTLE,
-    WAY,
     WIDTH,
-    lane_row_,
-    place,
-    slope_row_,
-    variance,
+    place_and_errors,
 )
 from can_imm.types import FloatArray
 
@@ -113,7 +109,7 @@ CHANGES_DTYPE = np.dtype(
 course (P00, P01, P11).  By lane (0 to `N_LANES` - 1, `EDGE` the ego's): log weight of keeping it,
 place and rate [m, m/s].  ``kept``: the lane that it keeps, -1 while that is not sure; by level of
 wander: log ``evidence`` for it, and covariance, place and rate if it were the true one.  The first
-``n`` courses that may be under way: see `lane_changes.COURSE_DTYPE`. """
+``n`` courses that may be under way: see `lane_changes.COURSE_DTYPE`."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -131,7 +127,6 @@ def begin_courses_(
 ) -> None:  # pragma: no cover - compiled
     """Add the courses that may begin now, or with the first measurement those under way."""
     first = one.n == 0 and one.t != one.t
-    duration, log_p = usual_durations()
     for lane in range(1, N_LANES - 1):
         if not first and one.log_w[lane] < -IMPOSSIBLE:
             continue
@@ -141,11 +136,11 @@ def begin_courses_(
             for i in range(2 * N_DURATIONS):
                 steady = i >= N_DURATIONS
                 share = par[P_CHANGE_STEADY] if steady else 1.0 - par[P_CHANGE_STEADY]
-                lasts = duration[i % N_DURATIONS] * (STEADY_TIME if steady else 1.0)
+                lasts = LASTS[i]
                 for b in range(N_BEGUN if first else 1):
                     span = lasts / N_BEGUN if first else t - one.begun
                     log_w = math.log(0.5 * par[P_CHANGE_RATE] * span * share)
-                    log_w += log_p[i % N_DURATIONS] + (0.0 if first else one.log_w[lane])
+                    log_w += LOG_P[i] + (0.0 if first else one.log_w[lane])
                     if one.n == N_COURSES or log_w < -IMPOSSIBLE:
                         continue
                     c = one.course[one.n]
@@ -202,12 +197,10 @@ def follow_(
         stay = math.log1p(-min(par[P_CHANGE_RATE] * dt, 0.5))
         for lane in range(N_LANES):
             one.log_w[lane] += stay
-            a, b = one.place[lane], one.rate[lane]
-            one.place[lane], one.rate[lane] = f[0] * a + f[1] * b, f[2] * a + f[3] * b
+            one.place[lane], one.rate[lane] = carried(one.place[lane], one.rate[lane], f)
         for q in range(one.n):
             c = one.course[q]
-            a, b = c.place, c.rate
-            c.place, c.rate = f[0] * a + f[1] * b, f[2] * a + f[3] * b
+            c.place, c.rate = carried(c.place, c.rate, f)
     one.t = t
     P, of_place, of_speed = gains(P, r, rv)
     one.cov[0], one.cov[1], one.cov[2] = P
@@ -307,8 +300,7 @@ def learn_wander_(
             f = fading(hurry, dt)
             cov = one.level_cov[i]
             P = spread((cov[0], cov[1], cov[2]), f, hurry, beside)
-            a, b = one.level_place[i], one.level_rate[i]
-            place, rate = f[0] * a + f[1] * b, f[2] * a + f[3] * b
+            place, rate = carried(one.level_place[i], one.level_rate[i], f)
         P, of_place, of_speed = gains(P, r, rv)
         one.level_cov[i, 0], one.level_cov[i, 1], one.level_cov[i, 2] = P
         one.level_place[i], one.level_rate[i], lost = correct(
@@ -456,7 +448,7 @@ def follow_all_(
         s = slot[k]
         if s < 0 or not notes[s].seen or notes[s].off > OFF:
             continue
-        x, y, noise = position(z[k], r[k], angle[k])
+        note = notes[s]
         cos, sin = math.cos(angle[k]), math.sin(angle[k])
         vx = z[k, 1] / cos if valid[k, 1] else 0.0
         vy, rv = 0.0, np.inf
@@ -464,14 +456,15 @@ def follow_all_(
             vx = z[k, 1] * cos - z[k, 3] * sin
             vy = z[k, 1] * sin + z[k, 3] * cos
             rv = r[k, 3] * cos * cos + r[k, 1] * sin * sin
-        to_lane, to_speed = place(road, h, x, vx, speed)
-        lane_row_(h, road[WAY], x)
-        road_error = min(par[P_BESIDE_ERROR] * variance(P, h), ROAD_ERROR)
+        to_lane, to_speed, of_place, of_direction = place_and_errors(
+            road, P, h, note.x, vx, speed
+        )  # fmt: skip
         if speed == speed:
-            slope_row_(h, road[WAY], x)
-            rv += par[P_BESIDE_SPEED_ERROR] * variance(P, h) * (speed + vx) ** 2
+            rv += par[P_BESIDE_SPEED_ERROR] * of_direction * (speed + vx) ** 2
+        road_error = min(par[P_BESIDE_ERROR] * of_place, ROAD_ERROR)
         follow_(
-            changes[s], t, y - to_lane, noise, vy - to_speed, rv, road_error, road[WIDTH], par
+            changes[s], t, note.y - to_lane, note.noise, vy - to_speed, rv, road_error,
+            road[WIDTH], par,
         )  # fmt: skip
 
 

@@ -29,6 +29,12 @@ USUAL, SPREAD = 4.3, 0.24
 STEADY, STEADY_TIME = 0.1, 0.6
 """Share of the lane changes at a constant rate, as in the published scenario, and how long they
 last in units of the usual durations."""
+_DURATION = np.geomspace(SHORTEST, LONGEST, N_DURATIONS)
+_LOG_P = -0.5 * np.square(np.log(_DURATION / USUAL) / SPREAD)
+LASTS: FloatArray = np.concatenate((_DURATION, STEADY_TIME * _DURATION))
+LOG_P: FloatArray = np.tile(_LOG_P - np.log(np.sum(np.exp(_LOG_P))), 2)
+"""Durations of the courses that are tried [s], and logarithms of their prior probabilities: smooth
+ones, and from `N_DURATIONS` on such at a constant rate."""
 HURRY = 0.5
 """How fast the place beside the course is forgotten [1/s]: rate of the Matern process."""
 IMPOSSIBLE = 18.0
@@ -103,6 +109,14 @@ def fading(hurry: float, dt: float) -> Four:  # pragma: no cover - compiled
         -hurry * hurry * dt * fade,
         (1.0 - hurry * dt) * fade,
     )
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def carried(
+    place: float, rate: float, f: Four
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Place and rate beside a course after the transition f."""
+    return f[0] * place + f[1] * rate, f[2] * place + f[3] * rate
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -190,16 +204,6 @@ def grown(courses: Any) -> Any:  # pragma: no cover - compiled
     return more
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def usual_durations() -> tuple[FloatArray, FloatArray]:  # pragma: no cover - compiled
-    """Durations (N,) of lane changes [s] and logarithms (N,) of their prior probabilities."""
-    duration, log_p = np.empty(N_DURATIONS), np.empty(N_DURATIONS)
-    for i in range(N_DURATIONS):
-        duration[i] = SHORTEST * (LONGEST / SHORTEST) ** (i / (N_DURATIONS - 1))
-        log_p[i] = -0.5 * (math.log(duration[i] / USUAL) / SPREAD) ** 2
-    return duration, log_p - math.log(np.sum(np.exp(log_p)))
-
-
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def begin_(
     course: Any,
@@ -247,7 +251,6 @@ def find_lane_changes_(
     like = np.zeros((n, N_LANES))
     beta = np.zeros((n, N_LANES))
     place, rate = np.zeros(N_LANES), np.zeros(N_LANES)
-    duration, log_p = usual_durations()
     courses = np.zeros(4096, COURSE_DTYPE)
     active = np.zeros(4096, np.int64)
     count = n_active = 0
@@ -267,7 +270,7 @@ def find_lane_changes_(
                     continue
                 for i in range(2 * N_DURATIONS):
                     steady = i >= N_DURATIONS
-                    lasts = duration[i % N_DURATIONS] * (STEADY_TIME if steady else 1.0)
+                    lasts = LASTS[i]
                     share = math.log(STEADY if steady else 1.0 - STEADY)
                     for b in range(1 if k > 0 else N_BEGUN):
                         if count == len(courses):
@@ -280,7 +283,7 @@ def find_lane_changes_(
                             span = lasts / N_BEGUN
                         c = courses[count]
                         begin_(c, k, n, start, lasts, lane, turn, steady)
-                        c.log_prior = math.log(0.5 * RATE * span) + log_p[i % N_DURATIONS] + share
+                        c.log_prior = math.log(0.5 * RATE * span) + LOG_P[i] + share
                         if k > 0:
                             c.log_before = alpha[k - 1, lane]
                             c.place, c.rate = place[lane], rate[lane]
@@ -293,13 +296,11 @@ def find_lane_changes_(
             P = spread(P, f, HURRY, beside[k])
             for lane in range(N_LANES):
                 alpha[k, lane] = alpha[k - 1, lane] + math.log1p(-min(RATE * dt, 0.5))
-                a, b = place[lane], rate[lane]
-                place[lane], rate[lane] = f[0] * a + f[1] * b, f[2] * a + f[3] * b
+                place[lane], rate[lane] = carried(place[lane], rate[lane], f)
         kept = 0
         for q in range(n_active):
             c = courses[active[q]]
-            a, b = c.place, c.rate
-            c.place, c.rate = f[0] * a + f[1] * b, f[2] * a + f[3] * b
+            c.place, c.rate = carried(c.place, c.rate, f)
             since = t[k] - c.start - c.duration
             if since >= 0.0 and c.end == n:
                 c.end = k

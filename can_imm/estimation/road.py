@@ -373,6 +373,26 @@ def place(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def place_and_errors(
+    road: FloatArray, P: FloatArray, h: FloatArray, x: float, vx: float, speed: float
+) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
+    """What `place` says, and the variances of the lateral position [m²] and of the road's direction
+    there [rad²]; the latter 0 where the ego's speed is unknown.
+
+    Args:
+        P: (N, N) covariance of the state.  The rest as of `place`.
+    """
+    lane_row_(h, road[WAY], x)
+    y, of_place = value(road, h), variance(P, h)
+    vy = of_direction = 0.0
+    if speed == speed:
+        slope_row_(h, road[WAY], x)
+        vy = (speed + vx) * value(road, h) + speed * road[MOUNTING]
+        of_direction = variance(P, h)
+    return y, vy, of_place, of_direction
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def lane_middles(roads: FloatArray, x: FloatArray) -> FloatArray:  # pragma: no cover - compiled
     """Lateral positions (M,) [m] of the middle of the ego's lane at the distances x (M,) [m].
 
@@ -419,17 +439,15 @@ def localise_(
         vx = z[k, 1] * cos if valid[k, 1] else 0.0
         if not (abs(x) < 1e4 and abs(vx) < 1e4):
             continue
-        y, vy = place(road, h, x, vx, speed)
-        lane_row_(h, road[WAY], x)
-        error = par[P_ERROR_WEIGHT] * variance(P, h)
+        y, vy, of_place, of_direction = place_and_errors(road, P, h, x, vx, speed)
+        error = par[P_ERROR_WEIGHT] * of_place
         error = min(error, par[P_ERROR_MOST] ** 2)
         z[k, 0] -= y * sin
         z[k, 2] -= y * cos
         r[k, 0] += error * sin * sin
         r[k, 2] += error * cos * cos
         if speed == speed:
-            slope_row_(h, road[WAY], x)
-            error = par[P_SPEED_ERROR_WEIGHT] * variance(P, h) * (speed + vx) ** 2
+            error = par[P_SPEED_ERROR_WEIGHT] * of_direction * (speed + vx) ** 2
             error = min(error, par[P_SPEED_ERROR_MOST] ** 2)
             z[k, 1] -= vy * sin
             z[k, 3] -= vy * cos

@@ -16,7 +16,7 @@ from small_roads import parameters
 from can_imm.estimation import changing as ch
 from can_imm.estimation import lane_changes as lc
 from can_imm.estimation import road
-from can_imm.estimation.guides import NOTE_DTYPE
+from can_imm.estimation.guides import NOTE_DTYPE, position
 from can_imm.types import REPORT_DTYPE, FloatArray
 
 WIDTH, HURRY, RATE, STEADY = 3.5, 0.5, 0.03, 0.1
@@ -542,6 +542,8 @@ class Slots:
         v = speed * (slot == 0)
         z[:, 1], z[:, 3] = v * sin, v * cos
         z[:, 0], z[:, 2] = u * cos + w * sin, w * cos - u * sin
+        for k, s in enumerate(slot):
+            note["x"][s], note["y"][s], note["noise"][s] = position(z[k], np.full(4, STD**2), angle)
         ch.follow_all_(
             self.changes, self.road, self.P, self.par, self.t, 25.0, note, n, slot,
             z, np.full((n, 4), STD**2), np.ones((n, 4), np.bool_), np.full(n, angle),
