@@ -14,7 +14,6 @@ NO_LANE = -128
 MEMORY_DTYPE = np.dtype(
     [
         ("left_ns", np.int64),
-        ("trust", np.float64),
         ("twin", np.int32),
         ("twin_scans", np.int32),
         ("kept", np.int16),
@@ -23,8 +22,7 @@ MEMORY_DTYPE = np.dtype(
     ],
     align=True,
 )
-"""What is remembered of a slot: ``changing`` a lane change was said of it, ``trust`` how far it was
-trusted (`reporting.doubt_`); ``kept`` the lane it kept last, ``left`` the lane that it left to the
+"""What is remembered of a slot: ``changing`` a lane change was said of it; ``kept`` the lane it kept last, ``left`` the lane that it left to the
 left at ``left_ns`` (lanes by number, `NO_LANE` for none); ``twin`` slot of an object that has been
 in the same place for ``twin_scans`` scans."""
 

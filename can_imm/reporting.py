@@ -10,7 +10,7 @@ import numpy as np
 
 from can_imm.estimation.constraints import normal_mass
 from can_imm.estimation.imm import extrapolate_
-from can_imm.estimation.road import WAY, place, slope_row_, variance
+from can_imm.estimation.road import place
 from can_imm.types import FloatArray, Manoeuvre
 
 _LANE_CHANGE = int(Manoeuvre.LANE_CHANGE)
@@ -29,12 +29,6 @@ RAMP_ODDS, RAMP_SPEED, RAMP_RATE, RAMP_MOST = -8.15, 7.4, 17.0, 0.5
 """Log odds that a vehicle said to keep its lane has begun to approach or recede because the ego
 speeds up or slows down: bias, factors of the speed [s/m] and of the ego's acceleration [s²/m],
 which counts up to the last value [m/s²].  Fitted on simulated traffic (settings "tuning")."""
-
-OVER = 0.2
-"""A lane change that is less probable is over."""
-
-WANDER_SPEED = 0.1
-"""Lateral speed of vehicles that keep their lane [m/s]."""
 
 LEAST = 1e-4
 """Where less is left for all that is no lane change, the speed tells what it would be."""
@@ -257,55 +251,5 @@ def judge_ramps_(acceleration: float, reports: Any, n: int) -> None:
         share = report.p[_KEEP_LANE] / (1.0 + math.exp(-odds))
         report.p[_KEEP_LANE] -= share
         report.p[to] += share
-        if decide_(report) != _LANE_CHANGE:
-            report.direction = 0
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def doubt_(
-    road: FloatArray,
-    P: FloatArray,
-    doubtful: float,
-    speed: float,
-    h: FloatArray,
-    ids: Any,
-    memory: Any,
-    reports: Any,
-) -> None:
-    """Trust lane changes no further than the road is known, in place.
-
-    A vehicle that keeps its lane where the road bends unseen moves across the lane where the road
-    is expected: with a lateral speed that is normal, of the uncertainty of the road's direction
-    times the vehicle's speed.  By how much likelier than that a lane change makes the lateral
-    speed, so much of its probability stays; the rest goes to what its speed makes of the object.
-    The trust stays until the lane change is over, however slowly it ends.
-
-    Args:
-        road, P: (N_ROAD,), (N_ROAD, N_ROAD) state and covariance of `estimation.road`.
-        doubtful: how much likelier lanes are kept than changed, times the spread of the lateral
-            speeds of lane changes [m/s].
-        speed: of the ego [m/s].
-        h: (N_ROAD,) scratch.
-        ids: (capacity,) object id of each slot, -1 for a free one.
-        memory: (capacity,) of `relations.MEMORY_DTYPE`.
-    """
-    k = -1
-    for s in range(ids.shape[0]):
-        if ids[s] < 0:
-            continue
-        k += 1
-        report = reports[k]
-        p = report.p[_LANE_CHANGE]
-        if report.age <= 1 or p < OVER:
-            memory[s].trust = 0.0
-        if p < 0.01:
-            continue
-        slope_row_(h, road[WAY], report.x[0])
-        s2 = WANDER_SPEED**2 + variance(P, h) * (speed + report.x[1]) ** 2
-        kept = doubtful * math.exp(-0.5 * report.x[3] ** 2 / s2) / math.sqrt(s2)
-        share = max(1.0 / (1.0 + kept), memory[s].trust)
-        memory[s].trust = share
-        report.p[_LANE_CHANGE] = share * p
-        report.p[by_speed(report.x[1])] += (1.0 - share) * p
         if decide_(report) != _LANE_CHANGE:
             report.direction = 0

@@ -28,13 +28,13 @@ from typing import Any
 import numpy as np
 
 from can_imm.estimation.entry import entry_point
-from can_imm.estimation.road import N_ROAD, P_DOUBTFUL, P_SETTLE, P_SURE
+from can_imm.estimation.road import N_ROAD, P_SETTLE, P_SURE
 from can_imm.estimation.smoother import smooth_
 from can_imm.estimation.smoother_pairs import SMOOTHER_DTYPE
 from can_imm.hindsight import LOOK_AHEAD_S, Hindsight
 from can_imm.manoeuvres import ModeBank
 from can_imm.relations import MEMORY_DTYPE, hesitate_, relate_, shift_lanes_
-from can_imm.reporting import doubt_, globalise_, judge_changes_, judge_ramps_
+from can_imm.reporting import globalise_, judge_changes_, judge_ramps_
 from can_imm.road import RoadFrame
 from can_imm.smoothing_rows import COASTING, FIRST, Reports, Rows, conclude_rows_, measurements
 from can_imm.types import REPORT_DTYPE, BoolArray, CanImmError, FloatArray, IntArray, Scan, Y
@@ -84,8 +84,7 @@ class _Scan:
         tracks, slots, rows: the reports' tracks, their slots and their rows counted from the
             tracks' first.
         moved: lanes that the ego moved to the left.
-        road, road_cov: state and covariance of the road, None and empty without one.
-        doubtful: see `RoadFrame`.
+        road: state of the road, None without one.
         ego_speed, acceleration: of the ego [m/s, m/s²], NaN where unknown.
         changes: (n, 2) for `reporting.judge_changes_`.
     """
@@ -97,8 +96,6 @@ class _Scan:
     rows: list[int]
     moved: int
     road: FloatArray | None = None
-    road_cov: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    doubtful: bool = False
     ego_speed: float = math.nan
     acceleration: float = math.nan
     changes: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
@@ -153,9 +150,8 @@ class _Smoother:
         if road is not None:
             # the filter's lane 0 is now another one
             self._shift += moved * road.width
-            noted.road, noted.road_cov = road.x.copy(), road.P.copy()
+            noted.road = road.x.copy()
             noted.ego_speed, noted.acceleration = road.speed, road.acceleration
-            noted.doubtful = road.doubtful
             if self._hindsight is not None:
                 number = self._hindsight.add(now, road, self._shift)
         self._grow_slots(len(ids))
@@ -239,11 +235,6 @@ class _Smoother:
             self._ids[scan.slots] = reports["object_id"]
             if self._road is not None:
                 judge_changes_(scan.changes, reports, n)
-                if scan.doubtful:
-                    doubt_(
-                        scan.road, scan.road_cov, self._road[P_DOUBTFUL], scan.ego_speed,
-                        self._h, self._ids, self._memory, reports,
-                    )  # fmt: skip
                 if not math.isnan(scan.acceleration):
                     judge_ramps_(scan.acceleration, reports, n)
                 hesitate_(self._ids, self._memory, self._road[P_SURE], reports, n)

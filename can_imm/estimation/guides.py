@@ -1,10 +1,4 @@
-"""The vehicles that show where the road is: what all of them do at once, it has done or the ego.
-
-A vehicle that begins to change lanes looks like a road that begins to bend, until more is known.
-So the road is learnt from the vehicles with hindsight: from each scan only some time later, when it
-is known which of them were changing lanes.  The road stands still meanwhile, and the ego's own
-motion is known.
-"""
+"""The vehicles of a scan, as `estimation.traffic` follows them."""
 
 from __future__ import annotations
 
@@ -14,37 +8,48 @@ from typing import Any
 import numba
 import numpy as np
 
+from can_imm.estimation.hypotheses import add_local_, begin_courses_, consider_, remove_guide_
+from can_imm.estimation.hypotheses import APART
 from can_imm.estimation.road import (
-    FREE,
-    N_GUIDES,
+    MOUNTING,
     N_ROAD,
-    OFFSET,
-    P_FREEDOM,
-    P_FREEDOM_CHANGING,
-    P_WANDER_STD,
-    P_WANDER_TIME,
+    P_BESIDE_RATE,
+    P_BESIDE_STD,
     WAY,
     WIDTH,
-    N,
     lane_row_,
-    scalar_update_,
-    value,
-    variance,
+    slope_row_,
+)
+from can_imm.estimation.traffic import (
+    EGO,
+    FREE,
+    N_GUIDES,
+    best_global,
+    lane_at,
+    measure_,
 )
 from can_imm.types import FloatArray, IntArray
 
-SEEN_TO = 200.0
-"""Vehicles further away [m] do not guide."""
-
-LANE_KNOWN = 0.2
-"""Share of the lane's width: a guide whose place is less sure does not tell where the lanes are."""
+SEEN_TO = 250.0
+"""Vehicles further away [m] are not followed."""
+SEEN_FROM = -50.0
+"""Nor are those further behind [m]."""
+UNSEEN_S = 1.0
+"""A vehicle that was not seen for longer is forgotten [s]."""
+OFF = 0.5
+"""An object that is not in our direction with a higher probability changes no lanes."""
+GATE = 16.0
+"""Squared normalised error above which a vehicle is not where it was."""
+MAX_OUTLIERS = 4
+"""After so many in a row it is another one."""
+TWIN_AHEAD, TWIN_BESIDE = 3.0, 1.0
+"""No two vehicles are so near along and across the road [m]."""
 
 NOTE_DTYPE = np.dtype(
     [
         ("x", np.float64),
         ("y", np.float64),
         ("noise", np.float64),
-        ("changing", np.float64),
         ("off", np.float64),
         ("seen", np.bool_),
         ("new", np.bool_),
@@ -52,45 +57,7 @@ NOTE_DTYPE = np.dtype(
     align=True,
 )
 """What a scan said of a slot's object: where it was measured in the vehicle's axes [m] and the
-variance of y [m²], and how probable it is that it changes lanes, and that it is off the lanes."""
-
-GATE = 16.0
-"""Squared normalised innovation above which a guide is not where it was."""
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def free_guide_(P: FloatArray, x: FloatArray, g: int) -> None:  # pragma: no cover - compiled
-    """Forget guide g."""
-    a = N_ROAD + g
-    x[a] = 0.0
-    for i in range(N):
-        P[a, i] = 0.0
-        P[i, a] = 0.0
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def begin_guide_(
-    x: FloatArray, P: FloatArray, h: FloatArray, g: int, y: float, r: float
-) -> None:  # pragma: no cover - compiled
-    """Guide g is first seen at y: its place is y minus the lane's, and as uncertain as both."""
-    a = N_ROAD + g
-    x[a] = y - value(x, h)
-    for i in range(N):
-        v = 0.0
-        for j in range(N_ROAD):
-            v -= h[j] * P[j, i]
-        P[a, i] = v
-        P[i, a] = v
-    P[a, a] = variance(P, h) + r
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def add_width_(P: FloatArray, a: int, times: float) -> None:  # pragma: no cover - compiled
-    """What becomes of the covariance when so many widths are added to state a."""
-    for i in range(P.shape[0]):
-        P[a, i] += times * P[WIDTH, i]
-    for i in range(P.shape[0]):
-        P[i, a] += times * P[i, WIDTH]
+variance of y [m²], and how probable it is that it is off the lanes."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -118,7 +85,7 @@ def note_(
     valid: Any,
     angle: FloatArray,
 ) -> None:  # pragma: no cover - compiled
-    """Write down what a scan says of where the vehicles are and of what they do.
+    """Write down what a scan says of where the vehicles are.
 
     Args:
         notes: (capacity,) of `NOTE_DTYPE`, by slot; written.
@@ -137,121 +104,215 @@ def note_(
         note = notes[s]
         note.seen = True
         note.x, note.y, note.noise = position(z[k], r[k], angle[k])
-        note.changing = 0.0
         note.off = 0.0
         for j in range(bank[0].n_modes):
-            if bank[0].direction[j] != 0:
-                note.changing += objects[s].mu[j]
             if bank[0].off_lane[j]:
                 note.off += objects[s].mu[j]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def learn_(
-    road: FloatArray,
-    P: FloatArray,
-    par: FloatArray,
-    guide_slot: IntArray,
-    guide_unseen: FloatArray,
-    notes: Any,
-    first: int,
-    later: int,
-    dt: float,
+def leave_(
+    T: Any, guide_of: IntArray, g: int
 ) -> None:  # pragma: no cover - compiled
-    """Update the road by the vehicles of one scan, knowing what became of them; in place.
-
-    Args:
-        road, P, par: as for `road.predict_road_`, at the time of the scan.
-        guide_slot: (24,) slot of each guide, `FREE` for none.
-        guide_unseen: (24,) for how long it was not measured [s].
-        notes: (E, capacity) of `NOTE_DTYPE`, a ring of scans.
-        first: the scan.  later: so many scans after it are known.
-        dt: since the scan before it [s].
-    """
-    h = np.zeros(N_ROAD + 1)
-    wander = par[P_WANDER_STD] ** 2 * max(par[P_WANDER_TIME] / dt, 1.0)
-    guide_of = np.full(notes.shape[1], FREE)
-    for g in range(N_GUIDES):
-        if guide_slot[g] == FREE:
-            continue
-        guide_unseen[g] += dt
-        if guide_unseen[g] > 1.0:
-            guide_slot[g] = FREE
-            free_guide_(P, road, g)
-        else:
-            guide_of[guide_slot[g]] = g
-    for s in range(notes.shape[1]):
-        note = notes[first, s]
-        g = guide_of[s]
-        if note.new and g != FREE:
-            guide_slot[g] = FREE
-            free_guide_(P, road, g)
-            g = FREE
-        if not note.seen:
-            continue
-        x, y, noise = note.x, note.y, note.noise
-        if note.off > 0.5 or not 0.0 < x < SEEN_TO:
-            if g != FREE:
-                guide_slot[g] = FREE
-                free_guide_(P, road, g)
-            continue
-        lane_row_(h, road[WAY], x)
-        if g == FREE:
-            for other in range(N_GUIDES):
-                if guide_slot[other] == FREE:
-                    guide_slot[other] = s
-                    guide_unseen[other] = 0.0
-                    begin_guide_(road, P, h, other, y, noise)
-                    break
-            continue
-        moving = note.changing
-        for k in range(1, later + 1):
-            after = notes[(first + k) % notes.shape[0], s]
-            if after.new:
-                break  # the slot has another object
-            if after.seen:
-                moving = max(moving, after.changing)
-        guide_unseen[g] = 0.0
-        a = N_ROAD + g
-        free = par[P_FREEDOM] * (1.0 - moving) + par[P_FREEDOM_CHANGING] * moving
-        P[a, a] += free * free * dt
-        h[N_ROAD] = 1.0
-        if not scalar_update_(road, P, h, g, y, noise, GATE):
-            free_guide_(P, road, g)
-            h[N_ROAD] = 0.0
-            begin_guide_(road, P, h, g, y, noise)
-            continue
-        # In the long run vehicles drive where the lanes are; but not those between them.
-        lane = math.floor(road[a] / road[WIDTH] + 0.5)
-        between = 2.0 * (road[a] / road[WIDTH] - lane)
-        known_lane = P[a, a] < (LANE_KNOWN * road[WIDTH]) ** 2
-        if moving > 0.5 or abs(lane) > 6.0 or abs(between) > 0.8 or not known_lane:
-            continue
-        for i in range(N_ROAD):
-            h[i] = 0.0
-        h[WIDTH] = -lane
-        doubt = 1.0 + 5.0 * (moving + between**4)
-        scalar_update_(road, P, h, g, 0.0, doubt * wander, np.inf)
+    """A vehicle is no longer followed, nor is its twin."""
+    remove_guide_(T, g)
+    for s in range(guide_of.shape[0]):
+        if guide_of[s] == g:
+            guide_of[s] = FREE
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def change_lane_(
-    road: FloatArray, P: FloatArray, guide_slot: IntArray, moved: int, width: float
+def twin_of(
+    T: Any, guide_of: IntArray, notes: Any, s: int
+) -> int:  # pragma: no cover - compiled
+    """The party that slot s is a second track of, `FREE` for none."""
+    for g in range(N_GUIDES):
+        other = T.party[g].slot
+        if (
+            other != FREE
+            and other != s
+            and notes[other].seen
+            and abs(notes[other].x - notes[s].x) < TWIN_AHEAD
+            and abs(notes[other].y - notes[s].y) < TWIN_BESIDE
+        ):
+            return g
+    return FREE
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def meet_(
+    T: Any, par: FloatArray, guide_of: IntArray, notes: Any, s: int, t: float
+) -> int:  # pragma: no cover - compiled
+    """Follow the vehicle in slot s from now on, if there is room; its party, else `FREE`.
+
+    It is in the lane that is nearest, in the next one, or between two.
+    """
+    g = 0
+    while g < N_GUIDES and T.party[g].slot != FREE:
+        g += 1
+    if g == N_GUIDES:
+        return FREE
+    party = T.party[g]
+    party.slot, party.unseen, party.outliers, party.since = s, 0.0, 0, t
+    guide_of[s] = g
+    a = N_ROAD + 2 * g
+    T.top = max(T.top, a + 2)
+    T.P[a, a] = par[P_BESIDE_STD] ** 2
+    T.P[a + 1, a + 1] = (par[P_BESIDE_RATE] * par[P_BESIDE_STD]) ** 2
+    lane_row_(T.h, T.x[WAY], notes[s].x)
+    best = best_global(T)
+    y = notes[s].y
+    for i in range(N_ROAD):
+        v = T.x[i] + T.rest[best, i]
+        for p in range(T.choice.shape[1]):
+            if T.choice[best, p] != FREE:
+                v += T.mean[T.choice[best, p], i]
+        y -= T.h[i] * v
+    seen = y / T.x[WIDTH]
+    lane = int(math.floor(seen + 0.5))
+    for to in (lane, lane - 1, lane + 1):
+        q = add_local_(T, g, to, 0, False, 0.0, 0.0, -1)
+        if q < 0:
+            # no room for hypotheses: it is not followed
+            remove_guide_(T, g)
+            guide_of[s] = FREE
+            return FREE
+        for k in range(T.n_global):
+            T.odds[k, q] = 0.0
+            if to == lane:
+                T.choice[k, g] = q
+    begin_courses_(T, g, t, par, seen)
+    return g
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def see_place_(
+    T: Any, g: int, x: float, y: float, noise: float, t: float
+) -> bool:  # pragma: no cover - compiled
+    """Take in where vehicle g is: at x, y [m] in the ego's axes, y with a variance; in place.
+
+    Returns:
+        False, and nothing changed, if it can't be there.
+    """
+    h, at = T.h, T.at
+    lane_row_(h, T.x[WAY], x)
+    width = T.x[WIDTH]
+    ours = T.choice[best_global(T), g]
+    lane, _, _ = lane_at(T.local[ours], t)
+    h[WIDTH] = lane
+    m = 0
+    for i in range(N_ROAD):
+        if h[i] != 0.0:
+            h[m], at[m] = h[i], i
+            m += 1
+    h[m], at[m] = 1.0, N_ROAD + 2 * g
+    for q in range(T.n):
+        if T.local[q].who == g:
+            other, _, _ = lane_at(T.local[q], t)
+            T.shift[q] = (other - lane) * width
+    return measure_(T, m + 1, y, noise, g, GATE)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def see_speed_(
+    T: Any, g: int, x: float, along: float, vy: float, noise: float, speed: float, t: float
 ) -> None:  # pragma: no cover - compiled
-    """The ego's lane is another one now, ``moved`` lanes to the left; in place.
+    """Take in how fast vehicle g moves across, vy [m/s] in the ego's axes with a variance; in place.
 
     Args:
-        road, P: (N,), (N, N), or (N_ROAD,) without the guides.
-        width: of the lanes [m].
+        x: where it is ahead [m].  along: its speed over ground [m/s].  speed: of the ego [m/s].
     """
-    shift = moved * width
-    road[OFFSET] -= shift
-    add_width_(P, OFFSET, -moved)
-    if road.shape[0] > N_ROAD:
-        for g in range(N_GUIDES):
-            if guide_slot[g] != FREE:
-                road[N_ROAD + g] -= shift
-                add_width_(P, N_ROAD + g, -moved)
+    h, at = T.h, T.at
+    slope_row_(h, T.x[WAY], x)
+    width = T.x[WIDTH]
+    ours = T.choice[best_global(T), g]
+    _, rate, _ = lane_at(T.local[ours], t)
+    m = 0
+    for i in range(N_ROAD):
+        v = h[i] * along
+        if i == MOUNTING:
+            v += speed
+        if v != 0.0:
+            h[m], at[m] = v, i
+            m += 1
+    h[m], at[m] = 1.0, N_ROAD + 2 * g + 1
+    for q in range(T.n):
+        if T.local[q].who == g:
+            _, other, _ = lane_at(T.local[q], t)
+            T.shift[q] = (other - rate) * width
+    measure_(T, m + 1, vy - rate * width, noise, g, GATE)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def watch_(
+    T: Any,
+    par: FloatArray,
+    guide_of: IntArray,
+    notes: Any,
+    t: float,
+    dt: float,
+    speed: float,
+    n: int,
+    slot: Any,
+    z: FloatArray,
+    r: FloatArray,
+    valid: Any,
+    angle: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """Take in the vehicles of a scan; in place.
+
+    Args:
+        T: record of `traffic.TRAFFIC_DTYPE`, at the scan's time.  par: `road.PARAMETERS`.
+        guide_of: (capacity,) party of each slot, `FREE` for none.
+        notes: (capacity,) of `NOTE_DTYPE`, of this scan.
+        t: time of the scan, dt: since the one before it [s].
+        speed: of the ego [m/s], NaN where unknown.
+        n: rows of the scan.  slot, z, r, valid, angle: (rows, ...) as it was measured.
+    """
+    for g in range(N_GUIDES):
+        s = T.party[g].slot
+        if s == FREE:
+            continue
+        T.party[g].unseen += dt
+        gone = notes[s].seen and (
+            notes[s].off > OFF or not SEEN_FROM < notes[s].x < SEEN_TO
+        )
+        if gone or notes[s].new or T.party[g].unseen > UNSEEN_S:
+            leave_(T, guide_of, g)
+    for k in range(n):
+        s = slot[k]
+        if s < 0 or not notes[s].seen or notes[s].off > OFF:
+            continue
+        note = notes[s]
+        if not SEEN_FROM < note.x < SEEN_TO:
+            continue
+        g = guide_of[s]
+        if g == FREE or T.party[g].slot != s:
+            guide_of[s] = g = twin_of(T, guide_of, notes, s)
+            if g != FREE:
+                continue
+            g = meet_(T, par, guide_of, notes, s, t)
+            if g == FREE:
+                continue
+        elif t - T.party[g].begun >= APART:
+            begin_courses_(T, g, t, par, np.nan)
+        party = T.party[g]
+        party.unseen = 0.0
+        if not see_place_(T, g, note.x, note.y, note.noise, t):
+            party.outliers += 1
+            if party.outliers == MAX_OUTLIERS:
+                leave_(T, guide_of, g)
+            continue
+        party.outliers = 0
+        if speed == speed and valid[k, 1] and valid[k, 3]:
+            cos, sin = math.cos(angle[k]), math.sin(angle[k])
+            along = speed + z[k, 1] * cos - z[k, 3] * sin
+            vy = z[k, 1] * sin + z[k, 3] * cos
+            noise = r[k, 3] * cos * cos + r[k, 1] * sin * sin
+            see_speed_(T, g, note.x, along, vy, noise, speed, t)
+    if t - T.party[EGO].begun >= APART:
+        begin_courses_(T, EGO, t, par, np.nan)
+    consider_(T, t, par)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

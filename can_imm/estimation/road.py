@@ -1,7 +1,7 @@
 """The road ahead and the ego vehicle's place on it, from its own motion and from the traffic.
 
 Lanes are measured against the ego vehicle, which itself wanders in its lane, changes it, and drives
-through bends.  One Kalman filter keeps apart what the road, the ego and the others do.  Its state:
+through bends.  The state of the road:
 
     offset of the ego from the middle of its lane, to the left [m]
     heading of the ego against the lane, to the left [rad]
@@ -9,8 +9,7 @@ through bends.  One Kalman filter keeps apart what the road, the ego and the oth
     heading of the radar's axes against the vehicle's [rad]
     width of the lanes [m]
     how far the ego has come from the first knot [m], which is known
-    curvature of the road at `N_KNOTS` knots, `SPACING` apart, to the left [1/m]
-    and for each of up to `N_GUIDES` vehicles its lateral place on the road [m].
+    curvature of the road at `N_KNOTS` knots, `SPACING` apart, to the left [1/m].
 
 Between the knots the curvature is linear: the road is a chain of clothoids (Dickmanns and
 Mysliwetz, 1992, have one).  The knots stand still on the ground; what the ego has passed is
@@ -20,8 +19,7 @@ is expected at
 
     y(x) = k width - offset - (heading + mounting) x + int_0^x (x - s) curvature(s) ds.
 
-The vehicles' places hardly change, and in the long run they are the middles of lanes; what all of
-them do at once the road or the ego has done.
+How it is learnt is told in `estimation.traffic`.
 """
 
 from __future__ import annotations
@@ -40,9 +38,6 @@ N_KNOTS = 10
 SPACING = 25.0
 """Between two knots [m].  The last one is at least 200 m ahead."""
 N_ROAD = KNOT + N_KNOTS
-N_GUIDES = 24
-"""Most vehicles that the road is seen by."""
-N = N_ROAD + N_GUIDES
 
 PARAMETERS = (
     "width",
@@ -61,24 +56,15 @@ PARAMETERS = (
     "yaw_noise",
     "yaw_noise_unknown",
     "drift",
-    "wander_std",
-    "wander_time",
-    "freedom",
-    "freedom_changing",
     "error_weight",
     "error_most",
     "speed_error_weight",
     "speed_error_most",
-    "hindsight",
     "beside_std",
-    "beside_spread",
     "beside_rate",
-    "beside_error",
-    "beside_speed_error",
     "change_rate",
     "change_steady",
     "settle",
-    "doubtful",
     "sure",
 )
 """Names of the parameters, in their order in the array.
@@ -87,25 +73,20 @@ PARAMETERS = (
 heading [rad], turning against the road [rad/s], curvature [1/m], yaw rate error [rad/s] and
 mounting [rad]: how large they get; ``*_time`` [s] and ``*_length`` [m]: how long they stay the
 same; ``yaw_noise`` [rad/√s] of the heading from the yaw rate, and without it; ``drift`` [m/√s] of
-the offset; ``wander_std`` [m] and ``wander_time`` [s] of a vehicle in its lane; ``freedom`` [m/√s]
-of its place, and while it changes lanes; ``*_weight``: by how much more the variances of this
-estimate count than those of white noise, since its errors last; ``*_most`` [m, m/s]: no larger
-error is added to the measurements' noise: however little is known of where the lanes are far ahead,
-that a vehicle moves across them is seen; ``hindsight`` [s]: see `estimation.guides`; and for
-`estimation.changing`: ``beside_std`` [m] of a vehicle's place beside the middle of its lane or its
-course into another, ``beside_spread`` of its logarithm among vehicles, ``beside_rate`` [1/s]: how
-fast such a place is forgotten, ``*_error``: by how much more the variances of this
-estimate count; ``change_rate`` [1/s] of lane changes, ``change_steady``: share of them at a
-constant rate, ``settle`` [s]: so long after it a lane change may still turn out to be none;
-``doubtful`` [m/s]: see `reporting.doubt_`; ``sure``: see `relations.hesitate_`.
+the offset; ``*_weight``: by how much more the variances of this estimate count than those of white
+noise, since its errors last; ``*_most`` [m, m/s]: no larger error is added to the measurements'
+noise: however little is known of where the lanes are far ahead, that a vehicle moves across them is
+seen.  And for `estimation.traffic`: ``beside_std`` [m] of a vehicle's place beside its course,
+``beside_rate`` [1/s]: how fast such a place is forgotten; ``change_rate`` [1/s] of lane changes,
+``change_steady``: share of them at a constant rate, ``settle`` [s]: so long after it a lane change
+may still turn out to be none; ``sure``: see `relations.hesitate_`.
 """
 (
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,
     P_TURN_STD, P_TURN_TIME, P_CURVATURE_STD, P_CURVATURE_LENGTH, P_BIAS_STD, P_MOUNTING_STD,
-    P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_WANDER_STD, P_WANDER_TIME, P_FREEDOM,
-    P_FREEDOM_CHANGING, P_ERROR_WEIGHT, P_ERROR_MOST, P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST,
-    P_HINDSIGHT, P_BESIDE_STD, P_BESIDE_SPREAD, P_BESIDE_RATE, P_BESIDE_ERROR, P_BESIDE_SPEED_ERROR,
-    P_CHANGE_RATE, P_CHANGE_STEADY, P_SETTLE, P_DOUBTFUL, P_SURE,
+    P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_ERROR_WEIGHT, P_ERROR_MOST, P_SPEED_ERROR_WEIGHT,
+    P_SPEED_ERROR_MOST, P_BESIDE_STD, P_BESIDE_RATE, P_CHANGE_RATE, P_CHANGE_STEADY, P_SETTLE,
+    P_SURE,
 ) = range(len(PARAMETERS))  # fmt: skip
 
 USUAL_SPEED = 25.0
@@ -114,15 +95,12 @@ USUAL_SPEED = 25.0
 BIAS_TIME = 120.0
 """How long the error of the yaw rate sensor stays the same [s]."""
 
-FREE = -1
-"""Entry of ``guide_slot`` that is not in use."""
-
 
 def new_road(par: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """State (N,) and covariance (N, N) before anything was seen."""
-    x = np.zeros(N)
+    """State (N_ROAD,) and covariance (N_ROAD, N_ROAD) before anything was seen."""
+    x = np.zeros(N_ROAD)
     x[OFFSET], x[WIDTH] = par[P_OFFSET], par[P_WIDTH]
-    P = np.zeros((N, N))
+    P = np.zeros((N_ROAD, N_ROAD))
     for i, k in (
         (OFFSET, P_OFFSET_STD),
         (HEADING, P_HEADING_STD),
@@ -133,49 +111,10 @@ def new_road(par: FloatArray) -> tuple[FloatArray, FloatArray]:
         P[i, i] = par[k] ** 2
     knots = SPACING * np.arange(N_KNOTS)
     apart = np.abs(knots[:, None] - knots)
-    P[KNOT:N_ROAD, KNOT:N_ROAD] = par[P_CURVATURE_STD] ** 2 * np.exp(
+    P[KNOT:, KNOT:] = par[P_CURVATURE_STD] ** 2 * np.exp(
         -apart / par[P_CURVATURE_LENGTH]
     )
     return x, P
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def scalar_update_(
-    x: FloatArray, P: FloatArray, h: FloatArray, g: int, z: float, r: float, gate: float
-) -> bool:  # pragma: no cover - compiled
-    """Kalman update by one value z = h x + noise of variance r, in place.
-
-    Args:
-        x: (N,).  P: (N, N).  h: (N_ROAD + 1,) row: the road's states, and that of guide g.
-        g: number of the guide, `FREE` for none.
-
-    Returns:
-        False, and nothing changed, if its squared normalised innovation is above ``gate``.
-    """
-    e, s = z, r
-    n = x.shape[0]
-    k = np.zeros(n)
-    for j in range(N_ROAD + 1):
-        c = j if j < N_ROAD else N_ROAD + g
-        if h[j] == 0.0 or (j == N_ROAD and g < 0):
-            continue
-        e -= h[j] * x[c]
-        for i in range(n):
-            k[i] += P[i, c] * h[j]
-    for j in range(N_ROAD + 1):
-        if j < N_ROAD or g >= 0:
-            s += h[j] * k[j if j < N_ROAD else N_ROAD + g]
-    if not (s > 0.0 and e * e <= gate * s):
-        return False
-    for i in range(n):
-        if k[i] == 0.0:
-            continue
-        x[i] += k[i] * e / s
-        for j in range(i + 1):
-            v = P[i, j] - k[i] * k[j] / s
-            P[i, j] = v
-            P[j, i] = v
-    return True
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -208,101 +147,6 @@ def bend_row_(
             h[KNOT + i] += (1.0 - share) * weight
             if share > 0.0:
                 h[KNOT + i + 1] += share * weight
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def predict_road_(
-    x: FloatArray, P: FloatArray, par: FloatArray, dt: float, speed: float, yaw_rate: float
-) -> None:  # pragma: no cover - compiled
-    """Move the ego on by ``dt`` seconds, in place.
-
-    Args:
-        x: (N,), or (N_ROAD,) without the guides.  P: square.  par: `PARAMETERS`.
-        speed, yaw_rate: of the ego [m/s, rad/s]; NaN where unknown.
-    """
-    known = speed == speed and yaw_rate == yaw_rate
-    v = speed if speed == speed else USUAL_SPEED
-    F = np.eye(N_ROAD)
-    F[BIAS, BIAS] = math.exp(-dt / BIAS_TIME)
-    F[OFFSET, HEADING] = v * dt
-    turned = 0.0
-    if known:
-        bend_row_(F[OFFSET], x[WAY], v * dt, True)
-        bend_row_(F[HEADING], x[WAY], v * dt, False)
-        for i in range(KNOT, N_ROAD):
-            F[OFFSET, i] = -F[OFFSET, i]
-            F[HEADING, i] = -F[HEADING, i]
-        F[OFFSET, BIAS] = -0.5 * v * dt * dt
-        F[HEADING, BIAS] = -dt
-        turned = yaw_rate * dt
-    y = np.zeros(N_ROAD)
-    for i in range(N_ROAD):
-        for j in range(N_ROAD):
-            y[i] += F[i, j] * x[j]
-    y[HEADING] += turned
-    y[OFFSET] += 0.5 * v * dt * turned
-    x[:N_ROAD] = y
-    P[:N_ROAD, :] = F @ P[:N_ROAD, :].copy()
-    P[:, :N_ROAD] = P[:, :N_ROAD].copy() @ F.T
-    yaw = par[P_YAW_NOISE] if known else par[P_YAW_NOISE_UNKNOWN]
-    P[HEADING, HEADING] += yaw**2 * dt
-    P[OFFSET, OFFSET] += par[P_DRIFT] ** 2 * dt
-    P[BIAS, BIAS] += par[P_BIAS_STD] ** 2 * (1.0 - F[BIAS, BIAS] ** 2)
-    x[WAY] = max(x[WAY] + v * dt, 0.0)
-    while x[WAY] >= SPACING:
-        pass_knot_(x, P, par)
-    # A driver keeps to the lane and along it, for a while at a time; what the ego turns is mostly
-    # the road's bend.
-    h = np.zeros(N_ROAD + 1)
-    h[HEADING] = 1.0
-    r = par[P_HEADING_STD] ** 2 * max(par[P_HEADING_TIME] / dt, 1.0)
-    scalar_update_(x, P, h, FREE, 0.0, r, np.inf)
-    h[HEADING] = 0.0
-    h[OFFSET] = 1.0
-    r = par[P_OFFSET_STD] ** 2 * max(par[P_OFFSET_TIME] / dt, 1.0)
-    scalar_update_(x, P, h, FREE, par[P_OFFSET], r, np.inf)
-    if known:
-        turn_with_road_(x, P, par, speed, yaw_rate, max(par[P_TURN_TIME] / dt, 1.0))
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def pass_knot_(
-    x: FloatArray, P: FloatArray, par: FloatArray
-) -> None:  # pragma: no cover - compiled
-    """The ego passes the second knot, in place: the first is forgotten, another added far ahead."""
-    last = N_ROAD - 1
-    x[WAY] -= SPACING
-    for i in range(KNOT, last):
-        x[i] = x[i + 1]
-    n = x.shape[0]
-    for i in range(KNOT, last):
-        for j in range(n):
-            P[i, j] = P[i + 1, j]
-    for i in range(KNOT, last):
-        for j in range(n):
-            P[j, i] = P[j, i + 1]
-    memory = math.exp(-SPACING / par[P_CURVATURE_LENGTH])
-    x[last] = memory * x[last - 1]
-    for j in range(n):
-        P[last, j] = memory * P[last - 1, j]
-        P[j, last] = P[last, j]
-    P[last, last] = memory**2 * P[last - 1, last - 1] + par[P_CURVATURE_STD] ** 2 * (
-        1.0 - memory**2
-    )
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def turn_with_road_(
-    x: FloatArray, P: FloatArray, par: FloatArray, speed: float, yaw_rate: float, weight: float
-) -> None:  # pragma: no cover - compiled
-    """The ego turns as the road does, with ``weight`` times the usual variance; in place."""
-    if speed == speed and yaw_rate == yaw_rate:
-        h = np.zeros(N_ROAD + 1)
-        here = x[WAY] / SPACING
-        h[BIAS] = 1.0
-        h[KNOT] = speed * (1.0 - here)
-        h[KNOT + 1] = speed * here
-        scalar_update_(x, P, h, FREE, yaw_rate, par[P_TURN_STD] ** 2 * weight, np.inf)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -359,7 +203,7 @@ def place(
     """Lateral position and speed against the ego of a vehicle that follows the ego's lane.
 
     Args:
-        road: (N,) state.  h: (N_ROAD + 1,) scratch.
+        road: (N_ROAD,) state.  h: (N_ROAD + 1,) scratch.
         x, vx: where it is ahead of the ego [m], and how much faster [m/s].
         speed: of the ego [m/s], NaN where unknown.
     """
@@ -380,7 +224,7 @@ def place_and_errors(
     there [rad²]; the latter 0 where the ego's speed is unknown.
 
     Args:
-        P: (N, N) covariance of the state.  The rest as of `place`.
+        P: (N_ROAD, N_ROAD) covariance of the state.  The rest as of `place`.
     """
     lane_row_(h, road[WAY], x)
     y, of_place = value(road, h), variance(P, h)
@@ -425,7 +269,7 @@ def localise_(
     the speed across the lane.  The uncertainty of the road adds to the variances.
 
     Args:
-        road: (N,).  P: (N, N).  par: `PARAMETERS`.
+        road: (N_ROAD,).  P: (N_ROAD, N_ROAD).  par: `PARAMETERS`.
         n: rows in use.  z, r: (rows, 4) values and variances.  valid: (rows, 4).
         angle: (rows,) [rad].
         speed: of the ego [m/s], NaN where unknown.

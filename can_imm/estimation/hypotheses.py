@@ -1,0 +1,422 @@
+"""Hypotheses of `estimation.traffic`: how they begin, split, merge and end, and what they say."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+
+from can_imm.estimation.lane_changes import SPREAD, STEADY_TIME, USUAL, add_logs
+from can_imm.estimation.road import (
+    N_ROAD,
+    P_CHANGE_RATE,
+    P_CHANGE_STEADY,
+    P_SETTLE,
+)
+from can_imm.estimation.traffic import (
+    FREE,
+    N_GLOBAL,
+    N_LOCAL,
+    N_PARTIES,
+    best_global,
+    global_weights_,
+    shares_,
+)
+from can_imm.types import FloatArray, IntArray
+
+N_DURATIONS = 7
+"""Durations of lane changes that are followed, and as many of those at a constant rate."""
+_DURATION = np.geomspace(2.5, 7.0, N_DURATIONS)
+_LOG_P = -0.5 * np.square(np.log(_DURATION / USUAL) / SPREAD)
+LASTS: FloatArray = np.concatenate((_DURATION, STEADY_TIME * _DURATION))
+LOG_P: FloatArray = np.tile(_LOG_P - np.log(np.sum(np.exp(_LOG_P))), 2)
+"""Durations of the courses [s], and logarithms of their prior probabilities; from `N_DURATIONS` on
+such at a constant rate."""
+N_BEGUN = 6
+"""Lane changes that had begun before a vehicle was first seen are tried from so many beginnings."""
+APART = 0.14
+"""Courses begin so long one after the other [s]."""
+IMPOSSIBLE = 13.0
+"""What is less likely than the best by this, as a logarithm, is given up."""
+RARE = 7.0
+"""What is less likely by this begins no courses."""
+SPLIT = 4.0
+"""A local hypothesis that makes a global one less likely by no more than this makes another one."""
+BETTER = 0.3
+"""And one of the same kind takes the place of the one chosen if it is likelier by this."""
+LATE = 10.0
+"""A global hypothesis that is less likely than the best by this is given up."""
+SPLITS = 3
+"""Most global hypotheses that are made in one scan."""
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def keeping(one: Any, t: float) -> int:  # pragma: no cover - compiled
+    """0 if the party changes lanes at time t, else 1."""
+    return 1 if one.turn == 0 or not 0.0 <= t - one.start < one.duration else 0
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def add_local_(
+    T: Any, who: int, lane: int, turn: int, steady: bool, start: float, duration: float, like: int
+) -> int:  # pragma: no cover - compiled
+    """Another local hypothesis, with the mean of the one named ``like`` or with none; its number,
+    -1 if there is no room.  Its odds are the caller's to write."""
+    q = T.n
+    if q == N_LOCAL:
+        return -1
+    one = T.local[q]
+    one.who, one.lane, one.turn, one.steady = who, lane, turn, steady
+    one.start, one.duration = start, duration
+    for i in range(T.mean.shape[1]):
+        T.mean[q, i] = T.mean[like, i] if like >= 0 else 0.0
+    T.n += 1
+    return q
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def begin_courses_(
+    T: Any, who: int, t: float, par: FloatArray, seen: float
+) -> None:  # pragma: no cover - compiled
+    """Add the courses of a party that may begin now.
+
+    Args:
+        seen: where it is, in lanes, if it is seen for the first time: then those under way that
+            pass there are added; else NaN.
+    """
+    first = seen == seen
+    since = t - T.party[who].begun
+    T.party[who].begun = t
+    n = T.n
+    for like in range(n):
+        one = T.local[like]
+        if one.who != who or (one.turn != 0 and t - one.start < one.duration):
+            continue
+        likely = False
+        for g in range(T.n_global):
+            likely |= T.odds[g, like] > -RARE
+        if not likely:
+            continue
+        lane = one.lane + one.turn
+        for turn in (-1, 1):
+            if first and abs(seen - (lane + 0.5 * turn)) > 1.0:
+                continue
+            for i in range(2 * N_DURATIONS):
+                steady = i >= N_DURATIONS
+                share = par[P_CHANGE_STEADY] if steady else 1.0 - par[P_CHANGE_STEADY]
+                for b in range(N_BEGUN if first else 1):
+                    span = LASTS[i] / N_BEGUN if first else since
+                    log_w = math.log(0.5 * par[P_CHANGE_RATE] * span * share) + LOG_P[i]
+                    if log_w < -IMPOSSIBLE:
+                        continue
+                    q = add_local_(
+                        T, who, lane, turn, steady, t - (b + 0.5) * span, LASTS[i], like
+                    )
+                    if q < 0:
+                        return
+                    for g in range(T.n_global):
+                        T.odds[g, q] = T.odds[g, like] + log_w
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def settle_(T: Any, who: int, t: float, settle: float) -> None:  # pragma: no cover - compiled
+    """A course that ended ``settle`` seconds ago is one with the lane that it led to; in place."""
+    first = -1
+    for q in range(T.n):
+        one = T.local[q]
+        if one.who != who:
+            continue
+        if one.turn != 0 and t - one.start >= one.duration + settle:
+            one.lane += one.turn
+            one.turn = 0
+        if one.turn != 0:
+            continue
+        for p in range(q):
+            other = T.local[p]
+            if other.who == who and other.turn == 0 and other.lane == one.lane:
+                merge_(T, p, q)
+                break
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def merge_(T: Any, p: int, q: int) -> None:  # pragma: no cover - compiled
+    """Local hypothesis p takes in q, of the same party, which is impossible from then on."""
+    who = T.local[p].who
+    best = best_global(T)
+    total = add_logs(T.odds[best, p], T.odds[best, q])
+    w = math.exp(T.odds[best, q] - total) if total > -np.inf else 0.0
+    for i in range(T.mean.shape[1]):
+        T.mean[p, i] += w * (T.mean[q, i] - T.mean[p, i])
+    for g in range(T.n_global):
+        T.odds[g, p] = add_logs(T.odds[g, p], T.odds[g, q])
+        T.odds[g, q] = -np.inf
+        if T.choice[g, who] == q:
+            T.choice[g, who] = p
+        if T.choice[g, who] == p:
+            rechoose_(T, g, who, p)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def rechoose_(T: Any, g: int, who: int, q: int) -> None:  # pragma: no cover - compiled
+    """In global hypothesis g the party takes course q; in place."""
+    gained = T.odds[g, q]
+    T.choice[g, who] = q
+    T.log_w[g] += gained
+    for p in range(T.n):
+        if T.local[p].who == who:
+            T.odds[g, p] -= gained
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def alike(T: Any, p: int, q: int) -> bool:  # pragma: no cover - compiled
+    """Whether two courses of a party lead from and to the same lanes."""
+    if p == q:
+        return True
+    if p == FREE or q == FREE:
+        return False
+    one, other = T.local[p], T.local[q]
+    return one.lane == other.lane and one.turn == other.turn
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def find_global(T: Any, g: int, who: int, q: int) -> int:  # pragma: no cover - compiled
+    """The global hypothesis like g but for the course q of a party; -1 if there is none."""
+    for other in range(T.n_global):
+        same = alike(T, T.choice[other, who], q)
+        p = 0
+        while same and p < N_PARTIES:
+            same = p == who or alike(T, T.choice[other, p], T.choice[g, p])
+            p += 1
+        if same:
+            return other
+    return -1
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def split_(T: Any) -> None:  # pragma: no cover - compiled
+    """Make the likeliest alternatives global hypotheses of their own; in place."""
+    n_before = T.n_global
+    for g in range(n_before):
+        for q in range(T.n):
+            who = T.local[q].who
+            if T.odds[g, q] > BETTER and alike(T, T.choice[g, who], q):
+                rechoose_(T, g, who, q)
+    for _ in range(SPLITS):
+        best = T.log_w[best_global(T)]
+        value, g, q = best - SPLIT, -1, -1
+        for one in range(n_before):
+            for p in range(T.n):
+                v = T.log_w[one] + T.odds[one, p]
+                who = T.local[p].who
+                if v <= value or alike(T, T.choice[one, who], p):
+                    continue
+                if find_global(T, one, who, p) < 0:
+                    value, g, q = v, one, p
+        if g < 0:
+            return
+        if T.n_global < N_GLOBAL:
+            to = T.n_global
+            T.n_global += 1
+        else:
+            to = 0
+            for one in range(1, N_GLOBAL):
+                if T.log_w[one] < T.log_w[to]:
+                    to = one
+            if T.log_w[to] >= value or to == g:
+                return
+        who = T.local[q].who
+        T.log_w[to] = T.log_w[g]
+        T.rest[to] = T.rest[g]
+        T.choice[to] = T.choice[g]
+        for p in range(T.n):
+            T.odds[to, p] = T.odds[g, p]
+        rechoose_(T, to, who, q)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def drop_globals_(T: Any) -> None:  # pragma: no cover - compiled
+    """Give up the unlikely global hypotheses, and the second of two alike; logarithms of weights
+    count from the best one; in place."""
+    best = T.log_w[best_global(T)]
+    kept = 0
+    for g in range(T.n_global):
+        T.log_w[g] -= best
+        keep = T.log_w[g] >= -LATE
+        other = 0
+        while keep and other < kept:
+            same = True
+            for p in range(N_PARTIES):
+                same = same and alike(T, T.choice[other, p], T.choice[g, p])
+            if same:
+                keep = False
+                if T.log_w[g] > T.log_w[other]:
+                    copy_global_(T, g, other)
+            other += 1
+        if keep:
+            copy_global_(T, g, kept)
+            kept += 1
+    T.n_global = kept
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def copy_global_(T: Any, g: int, to: int) -> None:  # pragma: no cover - compiled
+    """Global hypothesis g in the place of another."""
+    if g == to:
+        return
+    T.log_w[to] = T.log_w[g]
+    T.rest[to] = T.rest[g]
+    T.choice[to] = T.choice[g]
+    for q in range(T.n):
+        T.odds[to, q] = T.odds[g, q]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def drop_locals_(T: Any, gone: int) -> None:  # pragma: no cover - compiled
+    """Give up the impossible local hypotheses, and all of a party that is gone; in place.
+
+    What the courses of a party that is gone did to the means stays.
+
+    Args:
+        gone: number of the party, -1 for none.
+    """
+    to = np.full(T.n, FREE, np.int32)
+    if gone >= 0:
+        for g in range(T.n_global):
+            q = T.choice[g, gone]
+            if q != FREE:
+                for i in range(T.mean.shape[1]):
+                    T.rest[g, i] += T.mean[q, i]
+                T.choice[g, gone] = FREE
+    kept = 0
+    for q in range(T.n):
+        who = T.local[q].who
+        if who == gone:
+            continue
+        keep = False
+        for g in range(T.n_global):
+            keep |= T.log_w[g] + T.odds[g, q] >= -IMPOSSIBLE or T.choice[g, who] == q
+        if not keep:
+            continue
+        to[q] = kept
+        if kept < q:
+            T.local[kept] = T.local[q]
+            T.mean[kept] = T.mean[q]
+            for g in range(T.n_global):
+                T.odds[g, kept] = T.odds[g, q]
+        kept += 1
+    T.n = kept
+    for g in range(T.n_global):
+        for p in range(N_PARTIES):
+            if T.choice[g, p] != FREE:
+                T.choice[g, p] = to[T.choice[g, p]]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def consider_(T: Any, t: float, par: FloatArray) -> None:  # pragma: no cover - compiled
+    """After all measurements of a scan at time t [s]: settle, split, give up; in place."""
+    for who in range(N_PARTIES):
+        settle_(T, who, t, par[P_SETTLE])
+    split_(T)
+    drop_globals_(T)
+    drop_locals_(T, -1)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def remove_guide_(T: Any, g: int) -> None:  # pragma: no cover - compiled
+    """A vehicle is no longer followed; what it has shown of the road stays known."""
+    T.party[g].slot = FREE
+    drop_locals_(T, g)
+    for a in (N_ROAD + 2 * g, N_ROAD + 2 * g + 1):
+        T.x[a] = 0.0
+        for q in range(T.n):
+            T.mean[q, a] = 0.0
+        for k in range(T.n_global):
+            T.rest[k, a] = 0.0
+        for i in range(T.P.shape[0]):
+            T.P[a, i] = 0.0
+            T.P[i, a] = 0.0
+    top = 0
+    for k in range(N_PARTIES - 1):
+        if T.party[k].slot != FREE:
+            top = k + 1
+    T.top = N_ROAD + 2 * top
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def tell_changes_(
+    T: Any, guide_of: IntArray, ids: Any, t: float, p: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """How probable it is by what was measured until now that vehicles were changing lanes at t.
+
+    Args:
+        T: record of `traffic.TRAFFIC_DTYPE`.
+        guide_of: (capacity,) party of each slot, `FREE` for none.
+        ids: (capacity,) object id of each slot, -1 for a free one.
+        t: [s], not longer ago than the time to settle.
+        p: (N, 2) written for each slot in use, in their order: changing to the left, to the right;
+            NaN where nothing was known then.
+    """
+    w, share = np.empty(N_GLOBAL), np.empty(N_LOCAL)
+    total = np.empty((N_PARTIES, 2))
+    sides = np.zeros((N_PARTIES, 2))
+    global_weights_(T, w)
+    for g in range(T.n_global):
+        shares_(T, g, share, total)
+        for q in range(T.n):
+            one = T.local[q]
+            if not keeping(one, t):
+                sides[one.who, 0 if one.turn > 0 else 1] += w[g] * share[q]
+    row = 0
+    for s in range(ids.shape[0]):
+        if ids[s] < 0:
+            continue
+        who = guide_of[s]
+        known = who != FREE and t >= T.party[who].since
+        for side in range(2):
+            p[row, side] = sides[who, side] if known else np.nan
+        row += 1
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def tell_times_(
+    T: Any, guide_of: IntArray, ids: Any, now: float, reports: Any
+) -> None:  # pragma: no cover - compiled
+    """When the lane changes that are under way or have just ended begin and end: ``change`` of the
+    reports of all slots in use, in their order; NaN where there is probably none.
+
+    Args:
+        guide_of, ids: as for `tell_changes_`.  now: time of the last scan [s].
+        reports: (N,) of `REPORT_DTYPE`.
+    """
+    w, share = np.empty(N_GLOBAL), np.empty(N_LOCAL)
+    total = np.empty((N_PARTIES, 2))
+    # by party and side: weight, beginning and end from now on
+    found = np.zeros((N_PARTIES, 2, 3))
+    global_weights_(T, w)
+    for g in range(T.n_global):
+        shares_(T, g, share, total)
+        for q in range(T.n):
+            one = T.local[q]
+            if one.turn == 0:
+                continue
+            v = w[g] * share[q]
+            of = found[one.who, 0 if one.turn > 0 else 1]
+            of[0] += v
+            of[1] += v * (one.start - now)
+            of[2] += v * (one.start - now + one.duration)
+    row = 0
+    for s in range(ids.shape[0]):
+        if ids[s] < 0:
+            continue
+        report = reports[row]
+        row += 1
+        report.change[0] = report.change[1] = np.nan
+        if guide_of[s] == FREE:
+            continue
+        of = found[guide_of[s]]
+        side = 0 if of[0, 0] > of[1, 0] else 1
+        if of[side, 0] > 0.5:
+            report.change[0] = now + of[side, 1] / of[side, 0]
+            report.change[1] = now + of[side, 2] / of[side, 0]
