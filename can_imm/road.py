@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from can_imm.estimation import road
-from can_imm.estimation.guides import NOTE_DTYPE, note_, shift_objects_, watch_
+from can_imm.estimation.guides import NOTE_DTYPE, learn_habits_, note_, shift_objects_, watch_
 from can_imm.estimation.hypotheses import tell_changes_, tell_times_
 from can_imm.estimation.traffic import (
     FREE,
@@ -170,6 +170,10 @@ class RoadFrame:
             self.speed, scan.n, slot, scan.z, r, scan.valid, scan.angle,
         )  # fmt: skip
         summarise_(self._traffic, self.x, self.P)
+        learn_habits_(
+            self._traffic, self._par, self._guide_of, self._notes, self.x, self.P,
+            scan.t_ns * 1e-9, self._dt, self.speed, scan.n, slot, scan.z, r, scan.valid, scan.angle,
+        )  # fmt: skip
         moved = 0
         if abs(self.x[road.OFFSET]) > 0.5 * self.width:
             moved = 1 if self.x[road.OFFSET] > 0.0 else -1

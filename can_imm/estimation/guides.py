@@ -8,26 +8,36 @@ from typing import Any
 import numba
 import numpy as np
 
-from can_imm.estimation.hypotheses import add_local_, begin_courses_, consider_, remove_guide_
-from can_imm.estimation.hypotheses import APART
+from can_imm.estimation.hypotheses import (
+    APART,
+    add_local_,
+    begin_courses_,
+    consider_,
+    keeping,
+    remove_guide_,
+)
 from can_imm.estimation.road import (
     MOUNTING,
     N_ROAD,
     P_BESIDE_RATE,
-    P_BESIDE_STD,
+    USUAL_SPEED,
     WAY,
     WIDTH,
     lane_row_,
+    place_and_errors,
     slope_row_,
 )
 from can_imm.estimation.traffic import (
     EGO,
     FREE,
     N_GUIDES,
+    N_PARTIES,
     best_global,
     lane_at,
     measure_,
+    shares_,
 )
+from can_imm.estimation.wander import NO_LANE, forget_wander_, learn_wander_
 from can_imm.types import FloatArray, IntArray
 
 SEEN_TO = 250.0
@@ -38,10 +48,12 @@ UNSEEN_S = 1.0
 """A vehicle that was not seen for longer is forgotten [s]."""
 OFF = 0.5
 """An object that is not in our direction with a higher probability changes no lanes."""
-GATE = 16.0
+GATE = 25.0
 """Squared normalised error above which a vehicle is not where it was."""
 MAX_OUTLIERS = 4
 """After so many in a row it is another one."""
+CALM = 0.16
+"""A vehicle that is less likely to change lanes shows how it wanders."""
 TWIN_AHEAD, TWIN_BESIDE = 3.0, 1.0
 """No two vehicles are so near along and across the road [m]."""
 
@@ -69,6 +81,17 @@ def position(
     x = z[0] * cos - z[2] * sin
     y = z[0] * sin + z[2] * cos
     return x, y, r[2] * cos * cos + r[0] * sin * sin
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def velocity(
+    z: FloatArray, r: FloatArray, angle: float
+) -> tuple[float, float, float]:  # pragma: no cover - compiled
+    """vx and vy in the vehicle's axes [m/s], and the variance of vy, of a row (4,) of a scan."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    vx = z[1] * cos - z[3] * sin
+    vy = z[1] * sin + z[3] * cos
+    return vx, vy, r[3] * cos * cos + r[1] * sin * sin
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -157,8 +180,9 @@ def meet_(
     guide_of[s] = g
     a = N_ROAD + 2 * g
     T.top = max(T.top, a + 2)
-    T.P[a, a] = par[P_BESIDE_STD] ** 2
-    T.P[a + 1, a + 1] = (par[P_BESIDE_RATE] * par[P_BESIDE_STD]) ** 2
+    forget_wander_(party, par)
+    T.P[a, a] = party.beside**2
+    T.P[a + 1, a + 1] = (par[P_BESIDE_RATE] * party.beside) ** 2
     lane_row_(T.h, T.x[WAY], notes[s].x)
     best = best_global(T)
     y = notes[s].y
@@ -215,12 +239,12 @@ def see_place_(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def see_speed_(
-    T: Any, g: int, x: float, along: float, vy: float, noise: float, speed: float, t: float
+    T: Any, g: int, x: float, vx: float, vy: float, noise: float, speed: float, t: float
 ) -> None:  # pragma: no cover - compiled
     """Take in how fast vehicle g moves across, vy [m/s] in the ego's axes with a variance; in place.
 
     Args:
-        x: where it is ahead [m].  along: its speed over ground [m/s].  speed: of the ego [m/s].
+        x: where it is ahead [m].  vx: how much faster it is [m/s].  speed: of the ego [m/s].
     """
     h, at = T.h, T.at
     slope_row_(h, T.x[WAY], x)
@@ -229,7 +253,7 @@ def see_speed_(
     _, rate, _ = lane_at(T.local[ours], t)
     m = 0
     for i in range(N_ROAD):
-        v = h[i] * along
+        v = h[i] * (speed + vx)
         if i == MOUNTING:
             v += speed
         if v != 0.0:
@@ -269,6 +293,7 @@ def watch_(
         speed: of the ego [m/s], NaN where unknown.
         n: rows of the scan.  slot, z, r, valid, angle: (rows, ...) as it was measured.
     """
+    v = speed if speed == speed else USUAL_SPEED
     for g in range(N_GUIDES):
         s = T.party[g].slot
         if s == FREE:
@@ -304,15 +329,71 @@ def watch_(
                 leave_(T, guide_of, g)
             continue
         party.outliers = 0
-        if speed == speed and valid[k, 1] and valid[k, 3]:
-            cos, sin = math.cos(angle[k]), math.sin(angle[k])
-            along = speed + z[k, 1] * cos - z[k, 3] * sin
-            vy = z[k, 1] * sin + z[k, 3] * cos
-            noise = r[k, 3] * cos * cos + r[k, 1] * sin * sin
-            see_speed_(T, g, note.x, along, vy, noise, speed, t)
+        if valid[k, 1] and valid[k, 3]:
+            vx, vy, noise = velocity(z[k], r[k], angle[k])
+            see_speed_(T, g, note.x, vx, vy, noise, v, t)
     if t - T.party[EGO].begun >= APART:
         begin_courses_(T, EGO, t, par, np.nan)
     consider_(T, t, par)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def learn_habits_(
+    T: Any,
+    par: FloatArray,
+    guide_of: IntArray,
+    notes: Any,
+    road: FloatArray,
+    P: FloatArray,
+    t: float,
+    dt: float,
+    speed: float,
+    n: int,
+    slot: Any,
+    z: FloatArray,
+    r: FloatArray,
+    valid: Any,
+    angle: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """Learn from a scan how the vehicles that keep their lanes wander there; in place.
+
+    Args:
+        road, P: (N_ROAD,), (N_ROAD, N_ROAD) state of the road and its covariance, by this scan.
+        The others as for `watch_`.
+    """
+    share, changing = T.error, np.zeros(N_PARTIES)
+    h = np.zeros(N_ROAD + 1)
+    v = speed if speed == speed else USUAL_SPEED
+    best = best_global(T)
+    shares_(T, best, share, np.empty((N_PARTIES, 2)))
+    for q in range(T.n):
+        if not keeping(T.local[q], t):
+            changing[T.local[q].who] += share[q]
+    for k in range(n):
+        s = slot[k]
+        if s < 0 or not notes[s].seen or guide_of[s] == FREE:
+            continue
+        party = T.party[guide_of[s]]
+        if party.slot != s or party.unseen > 0.0:
+            continue
+        ours = T.local[T.choice[best, guide_of[s]]]
+        if changing[guide_of[s]] > CALM or not keeping(ours, t):
+            party.kept = NO_LANE
+            continue
+        lane = ours.lane + (ours.turn if t >= ours.start else 0)
+        note = notes[s]
+        vx, vy, rv = 0.0, 0.0, np.inf
+        if valid[k, 1]:
+            vx = z[k, 1] * math.cos(angle[k])
+        if valid[k, 1] and valid[k, 3]:
+            vx, vy, rv = velocity(z[k], r[k], angle[k])
+        y, its_vy, of_place, of_direction = place_and_errors(road, P, h, note.x, vx, v)
+        if rv < np.inf:
+            rv += of_direction * (v + vx) ** 2
+        learn_wander_(
+            party, lane, dt, note.y - y - lane * road[WIDTH], note.noise, vy - its_vy, rv,
+            of_place, par[P_BESIDE_RATE], par,
+        )  # fmt: skip
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

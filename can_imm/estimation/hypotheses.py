@@ -26,7 +26,7 @@ from can_imm.estimation.traffic import (
 )
 from can_imm.types import FloatArray, IntArray
 
-N_DURATIONS = 7
+N_DURATIONS = 11
 """Durations of lane changes that are followed, and as many of those at a constant rate."""
 _DURATION = np.geomspace(2.5, 7.0, N_DURATIONS)
 _LOG_P = -0.5 * np.square(np.log(_DURATION / USUAL) / SPREAD)
@@ -53,9 +53,9 @@ SPLITS = 3
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def keeping(one: Any, t: float) -> int:  # pragma: no cover - compiled
-    """0 if the party changes lanes at time t, else 1."""
-    return 1 if one.turn == 0 or not 0.0 <= t - one.start < one.duration else 0
+def keeping(one: Any, t: float) -> bool:  # pragma: no cover - compiled
+    """Whether a course keeps a lane at time t."""
+    return one.turn == 0 or not 0.0 <= t - one.start < one.duration
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -123,7 +123,6 @@ def begin_courses_(
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def settle_(T: Any, who: int, t: float, settle: float) -> None:  # pragma: no cover - compiled
     """A course that ended ``settle`` seconds ago is one with the lane that it led to; in place."""
-    first = -1
     for q in range(T.n):
         one = T.local[q]
         if one.who != who:

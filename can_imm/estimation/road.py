@@ -61,6 +61,7 @@ PARAMETERS = (
     "speed_error_weight",
     "speed_error_most",
     "beside_std",
+    "beside_spread",
     "beside_rate",
     "change_rate",
     "change_steady",
@@ -77,7 +78,7 @@ the offset; ``*_weight``: by how much more the variances of this estimate count 
 noise, since its errors last; ``*_most`` [m, m/s]: no larger error is added to the measurements'
 noise: however little is known of where the lanes are far ahead, that a vehicle moves across them is
 seen.  And for `estimation.traffic`: ``beside_std`` [m] of a vehicle's place beside its course,
-``beside_rate`` [1/s]: how fast such a place is forgotten; ``change_rate`` [1/s] of lane changes,
+``beside_spread`` of its logarithm among vehicles, ``beside_rate`` [1/s]: how fast such a place is forgotten; ``change_rate`` [1/s] of lane changes,
 ``change_steady``: share of them at a constant rate, ``settle`` [s]: so long after it a lane change
 may still turn out to be none; ``sure``: see `relations.hesitate_`.
 """
@@ -85,8 +86,8 @@ may still turn out to be none; ``sure``: see `relations.hesitate_`.
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,
     P_TURN_STD, P_TURN_TIME, P_CURVATURE_STD, P_CURVATURE_LENGTH, P_BIAS_STD, P_MOUNTING_STD,
     P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_ERROR_WEIGHT, P_ERROR_MOST, P_SPEED_ERROR_WEIGHT,
-    P_SPEED_ERROR_MOST, P_BESIDE_STD, P_BESIDE_RATE, P_CHANGE_RATE, P_CHANGE_STEADY, P_SETTLE,
-    P_SURE,
+    P_SPEED_ERROR_MOST, P_BESIDE_STD, P_BESIDE_SPREAD, P_BESIDE_RATE, P_CHANGE_RATE, P_CHANGE_STEADY,
+    P_SETTLE, P_SURE,
 ) = range(len(PARAMETERS))  # fmt: skip
 
 USUAL_SPEED = 25.0

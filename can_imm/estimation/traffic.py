@@ -35,7 +35,6 @@ from can_imm.estimation.road import (
     N_ROAD,
     OFFSET,
     P_BESIDE_RATE,
-    P_BESIDE_STD,
     P_BIAS_STD,
     P_CURVATURE_LENGTH,
     P_CURVATURE_STD,
@@ -56,6 +55,7 @@ from can_imm.estimation.road import (
     bend_row_,
     new_road,
 )
+from can_imm.estimation.wander import NO_LANE, WANDER_FIELDS
 from can_imm.types import FloatArray
 
 N_GUIDES = 24
@@ -106,6 +106,7 @@ TRAFFIC_DTYPE = np.dtype(
                 ("unseen", np.float64),
                 ("begun", np.float64),
                 ("since", np.float64),
+                *WANDER_FIELDS,
             ],
             (N_PARTIES,),
         ),
@@ -126,7 +127,7 @@ left, -1 right, 0 none) from ``start`` on within ``duration`` [s], at a constant
 ``log_w`` logarithms of the weights of the ``n_global`` global hypotheses, ``odds`` what is to be added
 if one party had another course.  Of a party: the detector's ``slot``, `FREE` for none; so many
 ``outliers`` in a row; for how long it is ``unseen``, when courses have ``begun`` last, and ``since`` when it is
-followed [s].  ``top``: states in use.  The rest is scratch: a measurement's row ``h`` for the states ``at``,
+followed [s]; and how it wanders (`wander`).  ``top``: states in use.  The rest is scratch: a measurement's row ``h`` for the states ``at``,
 ``shift`` by which a party's courses change what is expected, and their ``error``."""
 
 
@@ -279,7 +280,7 @@ def measure_(
     return True
 
 
-LIKELY = 6.0
+LIKELY = 14.0
 """What is less likely than the best by this, as a logarithm, does not tell what an outlier is."""
 MOST_LOST = 40.0
 """A squared normalised error counts as this at most."""
@@ -373,7 +374,8 @@ def predict_traffic_(
         carry_guide_(P, top, a, f)
         carry_guide_(P.T, top, a, f)
         # what is lost of the stationary covariance comes anew
-        s00, s11 = par[P_BESIDE_STD] ** 2, (hurry * par[P_BESIDE_STD]) ** 2
+        beside = T.party[g].beside
+        s00, s11 = beside**2, (hurry * beside) ** 2
         P[a, a] += s00 - f[0] * f[0] * s00 - f[1] * f[1] * s11
         P[a, a + 1] -= f[0] * f[2] * s00 + f[1] * f[3] * s11
         P[a + 1, a] = P[a, a + 1]
@@ -543,6 +545,9 @@ def change_lane_(T: Any, moved: int) -> None:  # pragma: no cover - compiled
         T.local[q].lane -= moved
     for g in range(T.n_global):
         T.rest[g, OFFSET] -= moved * T.rest[g, WIDTH]
+    for p in range(N_GUIDES):
+        if T.party[p].kept != NO_LANE:
+            T.party[p].kept -= moved
     for i in range(T.top):
         T.P[OFFSET, i] -= moved * T.P[WIDTH, i]
     for i in range(T.top):

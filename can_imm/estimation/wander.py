@@ -1,0 +1,118 @@
+"""How much a vehicle wanders in its lane, learnt while it keeps it.
+
+`LEVELS` of it are weighed by how well each foretells where the vehicle is.  Who drives calmly is
+sooner seen to leave.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+
+from can_imm.estimation.lane_changes import carried, correct, fading, gains, spread
+from can_imm.estimation.road import P_BESIDE_SPREAD, P_BESIDE_STD
+from can_imm.types import FloatArray
+
+LEVELS = np.array([0.06, 0.1, 0.16, 0.25, 0.4, 0.6])
+"""Standard deviations of places beside the middle of a lane that are told apart [m]."""
+N_LEVELS = len(LEVELS)
+MEMORY_S = 35.0
+"""So long it counts how a vehicle has wandered [s]."""
+SURPRISE = 9.0
+"""Squared normalised error of a measurement counts as this at most."""
+LONGEST_S = 1.0
+"""What was thought of a vehicle that was not seen for longer is of no use any more."""
+
+WANDER_FIELDS = [
+    ("kept", np.int32),
+    ("evidence", np.float64, (N_LEVELS,)),
+    ("level_cov", np.float64, (N_LEVELS, 3)),
+    ("level_place", np.float64, (N_LEVELS,)),
+    ("level_rate", np.float64, (N_LEVELS,)),
+    ("beside", np.float64),
+]
+"""Of one vehicle: the lane that it has kept, `NO_LANE` while that is not sure; log evidence for each
+level, and covariance (P00, P01, P11), place and rate if it were the true one; ``beside`` the standard
+deviation that follows [m]."""
+NO_LANE = -128
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def forget_wander_(one: Any, par: FloatArray) -> None:  # pragma: no cover - compiled
+    """Nothing is known of the vehicle.
+
+    Args:
+        one: record with `WANDER_FIELDS`.  par: `road.PARAMETERS`.
+    """
+    one.kept = NO_LANE
+    one.evidence[:] = 0.0
+    weigh_levels_(one, par)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def weigh_levels_(one: Any, par: FloatArray) -> None:  # pragma: no cover - compiled
+    """Set ``beside`` by the evidence and by what vehicles are like."""
+    most = -np.inf
+    log_w = np.empty(N_LEVELS)
+    for i in range(N_LEVELS):
+        apart = math.log(LEVELS[i] / par[P_BESIDE_STD]) / par[P_BESIDE_SPREAD]
+        log_w[i] = one.evidence[i] - 0.5 * apart**2
+        most = max(most, log_w[i])
+    mean = total = 0.0
+    for i in range(N_LEVELS):
+        w = math.exp(log_w[i] - most)
+        total += w
+        mean += w * LEVELS[i] ** 2
+    one.beside = math.sqrt(mean / total)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def learn_wander_(
+    one: Any,
+    lane: int,
+    dt: float,
+    off: float,
+    r: float,
+    off_speed: float,
+    rv: float,
+    road_error: float,
+    hurry: float,
+    par: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """Take in a measurement of a vehicle that keeps its lane.
+
+    Args:
+        lane: the lane.  dt: since the measurement before it [s].
+        off, off_speed: place and speed beside its middle [m, m/s].  r, rv: their variances,
+            infinite where not measured.
+        road_error: variance of where the middle is thought to be [m²].
+        hurry: rate of the Matern process [1/s].
+    """
+    begins = lane != one.kept
+    one.kept = lane
+    memory = math.exp(-dt / MEMORY_S) if dt <= LONGEST_S else 0.0
+    most = -np.inf
+    for i in range(N_LEVELS):
+        beside = math.sqrt(LEVELS[i] ** 2 + road_error)
+        if begins:
+            P = beside**2, 0.0, (hurry * beside) ** 2
+            place = rate = 0.0
+        else:
+            f = fading(hurry, dt)
+            cov = one.level_cov[i]
+            P = spread((cov[0], cov[1], cov[2]), f, hurry, beside)
+            place, rate = carried(one.level_place[i], one.level_rate[i], f)
+        P, of_place, of_speed = gains(P, r, rv)
+        one.level_cov[i, 0], one.level_cov[i, 1], one.level_cov[i, 2] = P
+        one.level_place[i], one.level_rate[i], lost = correct(
+            place, rate, off, off_speed, of_place, of_speed, SURPRISE
+        )
+        lost += math.log(of_place[0]) + math.log(of_speed[0])
+        one.evidence[i] = memory * one.evidence[i] - 0.5 * lost
+        most = max(most, one.evidence[i])
+    for i in range(N_LEVELS):
+        one.evidence[i] -= most
+    weigh_levels_(one, par)
