@@ -208,7 +208,7 @@ class Detector:
         if self._road is not None:
             self._road.warm_up(
                 self.bank, self._objects, self._slot, self._status, self._age,
-                self._id, self._memory, self.reports,
+                self._id, self.reports,
             )  # fmt: skip
         hesitate_(self._id, self._memory, 0.5, self.reports, 0)
         relate_(self._id, self._memory, self.reports, 0)
@@ -414,7 +414,7 @@ class Detector:
                 self._road, moved, scan, self._slot,
             )  # fmt: skip
         if self._road is not None:
-            self._road.judge_(self._id, self._memory, self.reports, scan.t_ns)
+            self._road.judge_(self._id, self.reports, scan.t_ns)
             hesitate_(self._id, self._memory, self._road.sure, self.reports, n)
             relate_(self._id, self._memory, self.reports, n)
             self._road.globalise_(self.reports, n)

@@ -94,7 +94,7 @@ class RoadFrame:
 
     def warm_up(
         self, bank: ModeBank, objects: Any, slot: Any, status: Any, age: Any,
-        ids: IntArray, memory: Any, reports: np.ndarray[Any, Any],
+        ids: IntArray, reports: np.ndarray[Any, Any],
     ) -> None:  # fmt: skip
         """Compile, or load from the cache, all that a scan needs: by a drive of another ego past
         nobody.  No slot may be in use."""
@@ -104,7 +104,7 @@ class RoadFrame:
             other.move(t_ns, 20.0, 0.0)
             other.localise_(scan, scan.z, scan.std)
             other.watch_(bank, objects, scan, slot, status, age)
-            other.judge_(ids, memory, reports, t_ns)
+            other.judge_(ids, reports, t_ns)
             other.globalise_(reports, 0)
         other._change_lane(bank, objects, 0)
 
@@ -185,9 +185,7 @@ class RoadFrame:
         change_lane_(self._traffic, moved)
         summarise_(self._traffic, self.x, self.P)
 
-    def judge_(
-        self, ids: IntArray, memory: Any, reports: np.ndarray[Any, np.dtype[np.void]], t_ns: int
-    ) -> None:
+    def judge_(self, ids: IntArray, reports: np.ndarray[Any, np.dtype[np.void]], t_ns: int) -> None:
         """Say in the reports of all slots in use who changed lanes at a time [ns], and who
         approaches or recedes since the ego changes its speed, in place.
 

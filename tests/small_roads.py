@@ -20,11 +20,9 @@ USUAL = {
     "heading_std": 0.01, "heading_time": 2.0, "turn_std": 0.01, "turn_time": 1.0,
     "curvature_std": 0.001, "curvature_length": 1000.0, "bias_std": 0.005, "mounting_std": 0.003,
     "yaw_noise": 0.001, "yaw_noise_unknown": 0.01, "drift": 0.05,
-    "wander_std": 0.2, "wander_time": 4.0, "freedom": 0.1, "freedom_changing": 1.0,
     "error_weight": 3.0, "error_most": 0.5, "speed_error_weight": 10.0, "speed_error_most": 2.0,
-    "hindsight": 0.5, "beside_std": 0.35, "beside_spread": 0.5, "beside_rate": 0.5,
-    "beside_error": 1.0, "beside_speed_error": 1.0, "change_rate": 0.03, "change_steady": 0.1,
-    "settle": 1.0, "doubtful": 0.5, "sure": 0.5,
+    "beside_std": 0.25, "beside_spread": 0.5, "beside_rate": 0.5, "change_rate": 0.03,
+    "change_steady": 0.1, "settle": 1.0, "sure": 0.5,
 }  # fmt: skip
 
 
@@ -100,21 +98,18 @@ class Traffic:
         self.scan([], np.zeros((0, 2)), **motion)
 
     @property
-    def x(self) -> FloatArray:
-        """The filter with its guides, as of the last scan that was learnt from."""
-        return self.frame._past
+    def filter(self) -> Any:
+        """The record of `traffic.TRAFFIC_DTYPE`."""
+        return self.frame._traffic
 
     @property
-    def P(self) -> FloatArray:
-        return self.frame._P_past
+    def guide_of(self) -> Any:
+        """(capacity,) party of each slot."""
+        return self.frame._guide_of
 
-    @property
-    def guide_slot(self) -> Any:
-        return self.frame._guide_slot
-
-    @property
-    def guide_unseen(self) -> FloatArray:
-        return self.frame._guide_unseen
+    def changing(self, slot: int) -> FloatArray:
+        """How probable it is that the vehicle in a slot changes to the left, to the right."""
+        return self.frame.changing(self.t_ns * 1e-9)[slot]
 
     @property
     def offset(self) -> float:

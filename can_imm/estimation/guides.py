@@ -134,9 +134,7 @@ def note_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def leave_(
-    T: Any, guide_of: IntArray, g: int
-) -> None:  # pragma: no cover - compiled
+def leave_(T: Any, guide_of: IntArray, g: int) -> None:  # pragma: no cover - compiled
     """A vehicle is no longer followed, nor is its twin."""
     remove_guide_(T, g)
     for s in range(guide_of.shape[0]):
@@ -145,9 +143,7 @@ def leave_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def twin_of(
-    T: Any, guide_of: IntArray, notes: Any, s: int
-) -> int:  # pragma: no cover - compiled
+def twin_of(T: Any, guide_of: IntArray, notes: Any, s: int) -> int:  # pragma: no cover - compiled
     """The party that slot s is a second track of, `FREE` for none."""
     for g in range(N_GUIDES):
         other = T.party[g].slot
@@ -193,7 +189,7 @@ def meet_(
                 v += T.mean[T.choice[best, p], i]
         y -= T.h[i] * v
     seen = y / T.x[WIDTH]
-    lane = int(math.floor(seen + 0.5))
+    lane = math.floor(seen + 0.5)
     for to in (lane, lane - 1, lane + 1):
         q = add_local_(T, g, to, 0, False, 0.0, 0.0, -1)
         if q < 0:
@@ -241,10 +237,11 @@ def see_place_(
 def see_speed_(
     T: Any, g: int, x: float, vx: float, vy: float, noise: float, speed: float, t: float
 ) -> None:  # pragma: no cover - compiled
-    """Take in how fast vehicle g moves across, vy [m/s] in the ego's axes with a variance; in place.
+    """Take in how fast vehicle g moves across; in place.
 
     Args:
-        x: where it is ahead [m].  vx: how much faster it is [m/s].  speed: of the ego [m/s].
+        x: where it is ahead [m].  vx, vy: its velocity against the ego's, in the ego's axes
+            [m/s].  noise: variance of vy.  speed: of the ego [m/s].
     """
     h, at = T.h, T.at
     slope_row_(h, T.x[WAY], x)
@@ -299,9 +296,7 @@ def watch_(
         if s == FREE:
             continue
         T.party[g].unseen += dt
-        gone = notes[s].seen and (
-            notes[s].off > OFF or not SEEN_FROM < notes[s].x < SEEN_TO
-        )
+        gone = notes[s].seen and (notes[s].off > OFF or not SEEN_FROM < notes[s].x < SEEN_TO)
         if gone or notes[s].new or T.party[g].unseen > UNSEEN_S:
             leave_(T, guide_of, g)
     for k in range(n):

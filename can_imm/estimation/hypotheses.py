@@ -55,7 +55,9 @@ SPLITS = 3
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def keeping(one: Any, t: float) -> bool:  # pragma: no cover - compiled
     """Whether a course keeps a lane at time t."""
-    return one.turn == 0 or not 0.0 <= t - one.start < one.duration
+    if one.turn == 0:
+        return True
+    return bool(not 0.0 <= t - one.start < one.duration)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -111,9 +113,7 @@ def begin_courses_(
                     log_w = math.log(0.5 * par[P_CHANGE_RATE] * span * share) + LOG_P[i]
                     if log_w < -IMPOSSIBLE:
                         continue
-                    q = add_local_(
-                        T, who, lane, turn, steady, t - (b + 0.5) * span, LASTS[i], like
-                    )
+                    q = add_local_(T, who, lane, turn, steady, t - (b + 0.5) * span, LASTS[i], like)
                     if q < 0:
                         return
                     for g in range(T.n_global):
@@ -176,7 +176,7 @@ def alike(T: Any, p: int, q: int) -> bool:  # pragma: no cover - compiled
     if p == FREE or q == FREE:
         return False
     one, other = T.local[p], T.local[q]
-    return one.lane == other.lane and one.turn == other.turn
+    return bool(one.lane == other.lane and one.turn == other.turn)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

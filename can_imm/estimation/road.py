@@ -34,9 +34,9 @@ from can_imm.types import FloatArray
 
 OFFSET, HEADING, BIAS, MOUNTING, WIDTH, WAY, KNOT = range(7)
 """Indices of the state; `KNOT` is that of the first knot."""
-N_KNOTS = 10
+N_KNOTS = 12
 SPACING = 25.0
-"""Between two knots [m].  The last one is at least 200 m ahead."""
+"""Between two knots [m].  The last one is at least 250 m ahead."""
 N_ROAD = KNOT + N_KNOTS
 
 PARAMETERS = (
@@ -77,17 +77,20 @@ same; ``yaw_noise`` [rad/√s] of the heading from the yaw rate, and without it;
 the offset; ``*_weight``: by how much more the variances of this estimate count than those of white
 noise, since its errors last; ``*_most`` [m, m/s]: no larger error is added to the measurements'
 noise: however little is known of where the lanes are far ahead, that a vehicle moves across them is
-seen.  And for `estimation.traffic`: ``beside_std`` [m] of a vehicle's place beside its course,
-``beside_spread`` of its logarithm among vehicles, ``beside_rate`` [1/s]: how fast such a place is forgotten; ``change_rate`` [1/s] of lane changes,
-``change_steady``: share of them at a constant rate, ``settle`` [s]: so long after it a lane change
-may still turn out to be none; ``sure``: see `relations.hesitate_`.
+seen.
+
+For `estimation.traffic`: ``beside_std`` [m] of a vehicle's place beside its course,
+``beside_spread`` of its logarithm among vehicles, ``beside_rate`` [1/s]: how fast such a place is
+forgotten; ``change_rate`` [1/s] of lane changes, ``change_steady``: share of them at a constant
+rate, ``settle`` [s]: so long after it a lane change may still turn out to be none; ``sure``: see
+`relations.hesitate_`.
 """
 (
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,
     P_TURN_STD, P_TURN_TIME, P_CURVATURE_STD, P_CURVATURE_LENGTH, P_BIAS_STD, P_MOUNTING_STD,
-    P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_ERROR_WEIGHT, P_ERROR_MOST, P_SPEED_ERROR_WEIGHT,
-    P_SPEED_ERROR_MOST, P_BESIDE_STD, P_BESIDE_SPREAD, P_BESIDE_RATE, P_CHANGE_RATE, P_CHANGE_STEADY,
-    P_SETTLE, P_SURE,
+    P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_ERROR_WEIGHT, P_ERROR_MOST,
+    P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST, P_BESIDE_STD, P_BESIDE_SPREAD, P_BESIDE_RATE,
+    P_CHANGE_RATE, P_CHANGE_STEADY, P_SETTLE, P_SURE,
 ) = range(len(PARAMETERS))  # fmt: skip
 
 USUAL_SPEED = 25.0
@@ -112,9 +115,7 @@ def new_road(par: FloatArray) -> tuple[FloatArray, FloatArray]:
         P[i, i] = par[k] ** 2
     knots = SPACING * np.arange(N_KNOTS)
     apart = np.abs(knots[:, None] - knots)
-    P[KNOT:, KNOT:] = par[P_CURVATURE_STD] ** 2 * np.exp(
-        -apart / par[P_CURVATURE_LENGTH]
-    )
+    P[KNOT:, KNOT:] = par[P_CURVATURE_STD] ** 2 * np.exp(-apart / par[P_CURVATURE_LENGTH])
     return x, P
 
 

@@ -1,4 +1,4 @@
-"""Road, ego and vehicles, told apart together: one Kalman filter, and hypotheses of who changes lanes.
+"""Road, ego and vehicles, told apart together: one Kalman filter, and hypotheses of lane changes.
 
 A vehicle that begins to change lanes looks like a road that begins to bend, and an ego that changes
 lanes like all the others doing so.  So all are estimated at once.  The state is that of the road
@@ -7,15 +7,15 @@ of that place [m, m/s]: it wanders about its course (Matern covariance of order 
 
 A course leads along the middle of a lane, or from there to the middle of the next one.  Given
 everybody's course all is linear and Gaussian, and since a course only adds what is known to what is
-expected, all hypotheses have one covariance in common and differ in their means: a hypothesis costs a
-vector, not a matrix.  As in multiple hypothesis tracking (Reid, 1979; Blackman, 2004) there are
+expected, all hypotheses have one covariance in common and differ in their means: a hypothesis costs
+a vector, not a matrix.  As in multiple hypothesis tracking (Reid, 1979; Blackman, 2004) there are
 
 - local hypotheses: a course of one party (a vehicle or the ego), and what it does to the mean;
 - global hypotheses: a course for each party.  The mean is a sum over the parties.  For each one it
   is kept how much likelier it would be if one party had another course.
 
-A local hypothesis that makes a global one likelier, or nearly as likely, becomes another global one;
-only the best are kept.
+A local hypothesis that makes a global one likelier, or nearly as likely, becomes another global
+one; only the best are kept (`estimation.hypotheses`).
 """
 
 from __future__ import annotations
@@ -124,11 +124,13 @@ local hypotheses q = ``choice[g]`` of all parties; ``P`` covariance of all.
 
 ``n`` local hypotheses are in use: party ``who`` changes from ``lane`` (0 the ego's) by ``turn`` (+1
 left, -1 right, 0 none) from ``start`` on within ``duration`` [s], at a constant rate if ``steady``.
-``log_w`` logarithms of the weights of the ``n_global`` global hypotheses, ``odds`` what is to be added
-if one party had another course.  Of a party: the detector's ``slot``, `FREE` for none; so many
-``outliers`` in a row; for how long it is ``unseen``, when courses have ``begun`` last, and ``since`` when it is
-followed [s]; and how it wanders (`wander`).  ``top``: states in use.  The rest is scratch: a measurement's row ``h`` for the states ``at``,
-``shift`` by which a party's courses change what is expected, and their ``error``."""
+``log_w`` logarithms of the weights of the ``n_global`` global hypotheses, ``odds`` what is to be
+added if one party had another course.
+
+Of a party: the detector's ``slot``, `FREE` for none; so many ``outliers`` in a row; for how long it
+is ``unseen``, when courses have ``begun`` last, ``since`` when it is followed [s]; and how it
+wanders (`wander`).  ``top``: states in use.  The rest is scratch: a measurement's row ``h`` for the
+states ``at``, ``shift`` by which a party's courses change what is expected, their ``error``."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -34,9 +34,9 @@ WANDER_FIELDS = [
     ("level_rate", np.float64, (N_LEVELS,)),
     ("beside", np.float64),
 ]
-"""Of one vehicle: the lane that it has kept, `NO_LANE` while that is not sure; log evidence for each
-level, and covariance (P00, P01, P11), place and rate if it were the true one; ``beside`` the standard
-deviation that follows [m]."""
+"""Of one vehicle: the lane that it has kept, `NO_LANE` while that is not sure; log evidence for
+each level, and covariance (P00, P01, P11), place and rate if it were the true one; ``beside`` the
+standard deviation that follows [m]."""
 NO_LANE = -128
 
 
