@@ -10,7 +10,7 @@ import pytest
 
 from can_imm import smoothing
 from can_imm.detector import Detector
-from can_imm.estimation.road import P_DOUBTFUL, P_SETTLE, WIDTH
+from can_imm.estimation.road import P_SETTLE, WIDTH
 from can_imm.manoeuvres import load_bank
 from can_imm.road import RoadFrame
 from can_imm.smoothing import FixedIntervalSmoother, FixedLagSmoother
@@ -307,8 +307,6 @@ def test_a_lane_change_of_the_ego_is_no_motion_of_the_others(lag: float) -> None
 
 MOTORWAY = load_bank("motorway")
 assert MOTORWAY.road is not None
-# the shares of the courses, before they are doubted
-MOTORWAY.road[P_DOUBTFUL] = 0.0
 TURN_S = 2.0
 
 

@@ -44,6 +44,9 @@ SEEN_TO = 250.0
 """Vehicles further away [m] are not followed."""
 SEEN_FROM = -50.0
 """Nor are those further behind [m]."""
+WIDTH_SEEN_TO, WIDTH_LANES = 100.0, 2
+"""Vehicles that are further away [m], or in a lane further aside, do not tell how wide the lanes are:
+their lane is not sure enough."""
 UNSEEN_S = 1.0
 """A vehicle that was not seen for longer is forgotten [s]."""
 OFF = 0.5
@@ -219,7 +222,11 @@ def see_place_(
     width = T.x[WIDTH]
     ours = T.choice[best_global(T), g]
     lane, _, _ = lane_at(T.local[ours], t)
-    h[WIDTH] = lane
+    if x < WIDTH_SEEN_TO and abs(lane) <= WIDTH_LANES:
+        h[WIDTH] = lane
+    else:
+        h[WIDTH] = 0.0
+        y -= lane * width
     m = 0
     for i in range(N_ROAD):
         if h[i] != 0.0:

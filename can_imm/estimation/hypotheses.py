@@ -46,7 +46,7 @@ SPLIT = 4.0
 """A local hypothesis that makes a global one less likely by no more than this makes another one."""
 BETTER = 0.3
 """And one of the same kind takes the place of the one chosen if it is likelier by this."""
-LATE = 10.0
+LATE = 20.0
 """A global hypothesis that is less likely than the best by this is given up."""
 SPLITS = 3
 """Most global hypotheses that are made in one scan."""
@@ -66,7 +66,7 @@ def add_local_(
 ) -> int:  # pragma: no cover - compiled
     """Another local hypothesis, with the mean of the one named ``like`` or with none; its number,
     -1 if there is no room.  Its odds are the caller's to write."""
-    q = T.n
+    q = int(T.n)
     if q == N_LOCAL:
         return -1
     one = T.local[q]

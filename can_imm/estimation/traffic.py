@@ -203,6 +203,25 @@ def best_global(T: Any) -> int:  # pragma: no cover - compiled
     return best
 
 
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def seen(
+    h: FloatArray, at: Any, m: int, state: FloatArray
+) -> float:  # pragma: no cover - compiled
+    """h[:m] times the states at[:m].  In four sums: one would wait for itself."""
+    a = b = c = d = 0.0
+    i = 0
+    while i + 4 <= m:
+        a += h[i] * state[at[i]]
+        b += h[i + 1] * state[at[i + 1]]
+        c += h[i + 2] * state[at[i + 2]]
+        d += h[i + 3] * state[at[i + 3]]
+        i += 4
+    while i < m:
+        a += h[i] * state[at[i]]
+        i += 1
+    return (a + b) + (c + d)
+
+
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def measure_(
     T: Any, m: int, z: float, r: float, who: int, gate: float
@@ -232,17 +251,14 @@ def measure_(
     for a in range(m):
         s += h[a] * gain[at[a]]
     for q in range(n):
-        v = -T.shift[q] if local[q].who == who else 0.0
-        for a in range(m):
-            v -= h[a] * mean[q, at[a]]
-        error[q] = v
+        error[q] = -seen(h, at, m, mean[q])
+        if local[q].who == who:
+            error[q] -= T.shift[q]
     errors = np.empty(N_GLOBAL)
     least = np.inf
     best = best_global(T)
     for g in range(n_global):
-        v = e
-        for a in range(m):
-            v -= h[a] * rest[g, at[a]]
+        v = e - seen(h, at, m, rest[g])
         for p in range(N_PARTIES):
             if choice[g, p] != FREE:
                 v += error[choice[g, p]]
@@ -256,25 +272,25 @@ def measure_(
                 least = min(least, (v + error[q]) ** 2)
     if not (s > 0.0 and least <= gate * s):
         return False
+    precision = 1.0 / s
     for g in range(n_global):
-        lost = min(errors[g] ** 2 / s, MOST_LOST)
+        lost = min(errors[g] ** 2 * precision, MOST_LOST)
         log_w[g] -= 0.5 * lost
         for q in range(n):
             v = errors[g] - error[choice[g, local[q].who]] + error[q]
-            odds[g, q] -= 0.5 * (min(v * v / s, MOST_LOST) - lost)
-        v = 0.0
-        for a in range(m):
-            v -= h[a] * rest[g, at[a]]
+            v *= v * precision
+            odds[g, q] -= 0.5 * ((v if v < MOST_LOST else MOST_LOST) - lost)
+        v = -seen(h, at, m, rest[g]) * precision
         if v != 0.0:
             for i in range(top):
-                rest[g, i] += gain[i] * (v / s)
+                rest[g, i] += gain[i] * v
     for q in range(n):
-        v = error[q] / s
-        if v != 0.0:
+        if error[q] * error[q] > TINY * s:
+            v = error[q] * precision
             for i in range(top):
                 mean[q, i] += gain[i] * v
     for i in range(top):
-        k = gain[i] / s
+        k = gain[i] * precision
         x[i] += k * e
         for j in range(i + 1):
             P[i, j] -= k * gain[j]
@@ -284,22 +300,26 @@ def measure_(
 
 LIKELY = 14.0
 """What is less likely than the best by this, as a logarithm, does not tell what an outlier is."""
+TINY = 1e-7
+"""A smaller squared normalised error moves no mean: most hypotheses have nothing to do with most
+measurements."""
+LEAST_SHARE = 1e-4
+"""A hypothesis that is less probable does not count for the road."""
 MOST_LOST = 40.0
 """A squared normalised error counts as this at most."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def carry_road_(rows: FloatArray, n: int, F: FloatArray) -> None:  # pragma: no cover - compiled
-    """The road's states of the first n rows, in place, by the transition matrix F."""
-    y = np.empty(N_ROAD)
+    """The road's states of the first n rows, in place, by the transition matrix F, which changes
+    offset, heading and the sensor's error only."""
     for q in range(n):
-        for i in range(N_ROAD):
-            v = 0.0
-            for j in range(N_ROAD):
-                v += F[i, j] * rows[q, j]
-            y[i] = v
-        for i in range(N_ROAD):
-            rows[q, i] = y[i]
+        offset = heading = 0.0
+        for j in range(N_ROAD):
+            offset += F[OFFSET, j] * rows[q, j]
+            heading += F[HEADING, j] * rows[q, j]
+        rows[q, BIAS] *= F[BIAS, BIAS]
+        rows[q, OFFSET], rows[q, HEADING] = offset, heading
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -505,13 +525,13 @@ def summarise_(T: Any, road: FloatArray, P: FloatArray) -> None:  # pragma: no c
     global_weights_(T, w)
     P[:, :] = T.P[:N_ROAD, :N_ROAD]
     for g in range(T.n_global):
-        if w[g] < 1e-4:
+        if w[g] < LEAST_SHARE:
             w[g] = 0.0
             continue
         shares_(T, g, share, total)
         part[:, :] = 0.0
         for q in range(T.n):
-            if share[q] < 1e-4:
+            if share[q] < LEAST_SHARE:
                 continue
             who = T.local[q].who
             for i in range(N_ROAD):
