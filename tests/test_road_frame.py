@@ -1,4 +1,4 @@
-"""The axes of the road from scan to scan: what is learnt when, silence, and the way back."""
+"""The axes of the road from scan to scan: silence, the ego's lane, the way back, what is said."""
 
 from __future__ import annotations
 
@@ -12,19 +12,18 @@ from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import norm
-from small_roads import KEEP, LEFT, Traffic, parameters
+from small_roads import Traffic, parameters
 
-from can_imm.estimation import guides, road
-from can_imm.relations import MEMORY_DTYPE
-from can_imm.reporting import WANDER_SPEED, doubt_, judge_changes_, judge_ramps_
-from can_imm.road import LONGEST_S, SCANS, RoadFrame
+from can_imm.estimation import road, traffic
+from can_imm.reporting import judge_changes_, judge_ramps_
+from can_imm.road import LONGEST_S, RoadFrame
 from can_imm.types import REPORT_DTYPE, Manoeuvre, Scan
 
 S = 1_000_000_000
 NAN = math.nan
 FREE = -1
 """Id of a slot that nobody is in."""
+LANE = 3.5
 
 
 def curvature(state: np.ndarray) -> float:
@@ -35,23 +34,57 @@ def curvature(state: np.ndarray) -> float:
 
 def driven(seconds: float, speed: float = 30.0, yaw_rate: float = 0.02) -> Traffic:
     """Past no vehicles at all, from second 0.1 on."""
-    traffic = Traffic(parameters())
+    drive = Traffic(parameters())
     for _ in range(int(seconds * 10) + 1):
-        traffic.nothing(speed=speed, yaw_rate=yaw_rate)
-    return traffic
+        drive.nothing(speed=speed, yaw_rate=yaw_rate)
+    return drive
+
+
+def change(t: float, begin: float, seconds: float) -> tuple[float, float]:
+    """Way and speed of a smooth lane change at time t, in lanes."""
+    u = (t - begin) / seconds
+    if not 0.0 < u < 1.0:
+        return float(u >= 1.0), 0.0
+    return u * u * (3.0 - 2.0 * u), 6.0 * u * (1.0 - u) / seconds
+
+
+def lanes_of(drive: Traffic, slots: Any) -> list[float]:
+    """In which lanes the vehicles are, or between which."""
+    T = drive.filter
+    best = T["choice"][traffic.best_global(T)]
+    t = drive.t_ns * 1e-9
+    return [traffic.lane_at(T["local"][best[drive.guide_of[s]]], t)[0] for s in slots]
 
 
 def test_making_one_leaves_the_road_as_it_is() -> None:
-    """Compiling must not drive."""
+    """Nothing was driven yet."""
     x, P = road.new_road(parameters())
     frame = RoadFrame(parameters())
-    np.testing.assert_array_equal(frame.x, x[: road.N_ROAD])
-    np.testing.assert_array_equal(frame.P, P[: road.N_ROAD, : road.N_ROAD])
+    np.testing.assert_array_equal(frame.x, x)
+    np.testing.assert_array_equal(frame.P, P)
     assert frame.width == 3.5
-    fresh = RoadFrame(parameters())
-    for one in (frame, fresh):
-        one.move(S, 30.0, 0.01)
-    np.testing.assert_array_equal(frame._past, fresh._past)
+    assert frame.sure == 0.5
+    assert math.isnan(frame.speed + frame.yaw_rate + frame.acceleration)
+
+
+def test_warming_up_is_no_drive() -> None:
+    """Neither of the ego, nor past the objects that were there."""
+    warm, cold = Traffic(parameters(), capacity=4), Traffic(parameters(), capacity=4)
+    warm.objects["mean"][:] = warm.objects["x"][:] = 0.7
+    objects, age = warm.objects.copy(), warm.age.copy()
+    ids, reports = np.full(4, FREE, np.int32), np.zeros(4, REPORT_DTYPE)
+    warm.frame.warm_up(
+        warm.bank, warm.objects, np.zeros(1, np.int32), np.zeros(1, np.int8), warm.age,
+        ids, reports,
+    )  # fmt: skip
+    assert warm.objects.tobytes() == objects.tobytes()
+    assert warm.age.tobytes() == age.tobytes()
+    assert reports.tobytes() == np.zeros(4, REPORT_DTYPE).tobytes()
+    assert np.isnan(warm.frame.changing(0.05)).all()
+    for drive in (warm, cold):
+        drive.scan([0, 2], [[40.0, 0.3], [60.0, -3.0]], speed=30.0, yaw_rate=0.01)
+    assert warm.filter.tobytes() == cold.filter.tobytes()
+    assert warm.frame.x.tobytes() == cold.frame.x.tobytes()
 
 
 def test_the_first_scan_begins_with_the_bend_that_the_ego_drives() -> None:
@@ -63,48 +96,63 @@ def test_the_first_scan_begins_with_the_bend_that_the_ego_drives() -> None:
     np.testing.assert_array_equal(straight.x, road.new_road(parameters())[0][: road.N_ROAD])
 
 
+def wide(seconds: float, width: float = 4.0) -> Traffic:
+    """Past three vehicles in lanes of another width than usual."""
+    drive = Traffic(parameters())
+    for _ in range(int(seconds * 10)):
+        drive.scan(
+            [0, 1, 4], [[30.0, -width], [50.0, width], [45.0, 0.0]],
+            speed=30.0, yaw_rate=0.0, speeds=False,
+        )  # fmt: skip
+    return drive
+
+
 @pytest.mark.parametrize(("silence", "anew"), [(0.9, False), (1.1, True), (3600.0, True)])
 def test_after_a_long_silence_only_the_width_is_kept(silence: float, anew: bool) -> None:
-    traffic = driven(10.0)
-    frame = traffic.frame
-    traffic.x[[road.WIDTH, road.OFFSET]] = 3.8, 1.0
-    traffic.P[road.WIDTH, road.WIDTH] = 0.001
-    traffic.guide_slot[4] = 2
+    drive = wide(20.0)
+    frame, T = drive.frame, drive.filter
+    width, variance = frame.width, float(frame.P[road.WIDTH, road.WIDTH])
+    assert width == pytest.approx(4.0, abs=0.1), "learnt from the traffic"
+    assert variance < 0.5 * 0.25**2
     assert (silence > LONGEST_S) == anew
-    frame.move(traffic.t_ns + int(silence * S), NAN, NAN)
-    assert frame.width == pytest.approx(3.8)
-    assert frame.P[road.WIDTH, road.WIDTH] == pytest.approx(0.001)
-    assert (frame.x[road.OFFSET] == 0.0) == anew
-    assert (traffic.guide_slot == road.FREE).all() == anew
+    assert abs(drive.offset) > 1e-6
+    frame.move(drive.t_ns + int(silence * S), NAN, NAN)
+    assert frame.width == pytest.approx(width, abs=1e-12 if anew else 0.02)
+    assert frame.P[road.WIDTH, road.WIDTH] == pytest.approx(variance, rel=1e-9 if anew else 0.1)
+    assert (T["party"]["slot"] == traffic.FREE).all() == anew
+    assert (drive.guide_of == traffic.FREE).all() == anew
+    assert (T["n_global"] == T["n"] == 1) == anew
+    assert np.isnan(frame.changing(drive.t_ns * 1e-9)).all() == anew
     if anew:
-        others = np.arange(road.N) != road.WIDTH
         x, P = road.new_road(parameters())
-        np.testing.assert_array_equal(traffic.x[others], x[others])
-        np.testing.assert_array_equal(traffic.P[others], P[others])
-        np.testing.assert_array_equal(frame.x, traffic.x[: road.N_ROAD])
-        np.testing.assert_array_equal(frame.P, traffic.P[: road.N_ROAD, : road.N_ROAD])
+        x[road.WIDTH], P[road.WIDTH, road.WIDTH] = width, variance
+        np.testing.assert_allclose(frame.x, x, atol=1e-12)
+        np.testing.assert_allclose(frame.P, P, rtol=1e-9)
 
 
 def test_scans_before_a_silence_are_not_learnt_from_after_it() -> None:
-    """The road after it is that of a drive that begins there."""
-    late, fresh = Traffic(parameters()), Traffic(parameters())
-    for _ in range(7):
-        late.scan([0, 1], [[40.0, 1.0], [50.0, -2.5]], speed=30.0, yaw_rate=0.02)
+    """All is that of a drive that begins there, in lanes of that width."""
+    late, fresh = wide(4.0), Traffic(parameters())
     fresh.t_ns = late.t_ns + 5 * S
     fresh.age[:] = late.age
-    fresh.x[road.WIDTH] = late.x[road.WIDTH]
-    fresh.P[road.WIDTH, road.WIDTH] = late.P[road.WIDTH, road.WIDTH]
-    for k in range(9):
-        for traffic in (late, fresh):
-            traffic.scan(
-                [0, 1], [[42.0, 0.2 * k], [50.0, -3.0]],
-                dt=5.1 if k == 0 and traffic is late else 0.1, speed=30.0, yaw_rate=0.0,
+    fresh.frame.x[road.WIDTH] = late.width
+    fresh.frame.P[road.WIDTH, road.WIDTH] = late.frame.P[road.WIDTH, road.WIDTH]
+    for k in range(40):
+        for one in (late, fresh):
+            one.scan(
+                [0, 1], [[42.0, 0.1 * k], [50.0, -3.0]],
+                dt=5.1 if k == 0 and one is late else 0.1, speed=30.0, yaw_rate=0.0,
+                speeds=False,
             )  # fmt: skip
         assert late.t_ns == fresh.t_ns
-        np.testing.assert_array_equal(late.x, fresh.x)
-        np.testing.assert_array_equal(late.P, fresh.P)
+        for name in ("x", "P", "n", "n_global", "log_w"):
+            np.testing.assert_array_equal(late.filter[name], fresh.filter[name])
         np.testing.assert_array_equal(late.frame.x, fresh.frame.x)
-    assert late.offset != 0.0
+        np.testing.assert_array_equal(late.frame.P, fresh.frame.P)
+        np.testing.assert_array_equal(late.changing(0), fresh.changing(0))
+        np.testing.assert_array_equal(late.guide_of, fresh.guide_of)
+    assert late.changing(0)[0] > 0.5
+    assert late.width != 3.5
 
 
 @pytest.mark.parametrize(("speed", "yaw_rate"), [(NAN, NAN), (30.0, NAN), (NAN, 0.02)])
@@ -118,213 +166,122 @@ def test_unknown_ego_motion(speed: float, yaw_rate: float) -> None:
     assert frame.P[road.HEADING, road.HEADING] > known.P[road.HEADING, road.HEADING]
 
 
-# ---- what is learnt when
+# ---- the ego changes lanes
 
 
-class Diary:
-    """The same by a list of all scans: what is far enough back was learnt from, in its order.
+class EgoChange:
+    """An ego that changes lanes from second 4 on within 4.5 s, among vehicles that keep theirs.
 
-    The present road is predicted from what was learnt up to the scan before, as the new one's
-    objects are put into it before they are learnt from; unless nothing is left to predict.
+    Args:
+        by: lanes to the left.  known: the bus tells how it drives.
     """
 
-    def __init__(self, par: np.ndarray, hindsight: float) -> None:
-        self.par, self.hindsight = par, hindsight
-        self.x, self.P = road.new_road(par)
-        self.slots = np.full(road.N_GUIDES, road.FREE, np.int32)
-        self.unseen = np.zeros(road.N_GUIDES)
-        self.scans: list[tuple[float, float, float, Any]] = []
-        self.t, self.learnt = 0.0, 0
+    ahead, lanes = np.array([25.0, 40.0, 60.0, 90.0]), np.array([-1, 0, 1, 2])
+    speed = 28.0
 
-    def _predict(self, x: np.ndarray, P: np.ndarray, k: int) -> float:
-        t, speed, yaw_rate, _ = self.scans[k]
-        if k == 0:
-            road.turn_with_road_(x, P, self.par, speed, yaw_rate, 1.0)
-            return 0.001
-        dt = t - self.scans[k - 1][0]
-        road.predict_road_(x, P, self.par, dt, speed, yaw_rate)
-        return dt
+    def __init__(self, by: int, known: bool = True, seed: int = 1) -> None:
+        self.drive = Traffic(parameters(), capacity=6)
+        self.slots = [0, 1, 3, 5]
+        self._rng = np.random.default_rng(seed)
+        self._by, self._known, self._heading, self._k = by, known, 0.0, 0
 
-    def scan(
-        self, t: float, speed: float, yaw_rate: float, notes: Any
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the present road and its covariance."""
-        self.scans.append((t, speed, yaw_rate, notes))
-        now = len(self.scans) - 1
-        x, P = self.x.copy(), self.P.copy()
-        for k in range(self.learnt, now + 1):
-            self._predict(x, P, k)
-        everything = math.isnan(speed + yaw_rate) or not notes["seen"].any()
-        while self.learnt <= now and (
-            everything
-            or t - self.scans[self.learnt][0] >= self.hindsight
-            or now - self.learnt >= SCANS - 1
-        ):
-            dt = self._predict(self.x, self.P, self.learnt)
-            ring = np.concatenate([s[3] for s in self.scans])
-            guides.learn_(
-                self.x, self.P, self.par, self.slots, self.unseen,
-                ring, self.learnt, now - self.learnt, dt,
-            )  # fmt: skip
-            self.learnt += 1
-        if self.learnt > now:
-            x, P = self.x.copy(), self.P.copy()
-        return x[: road.N_ROAD], P[: road.N_ROAD, : road.N_ROAD]
+    def scan(self) -> int:
+        """The next one; what `RoadFrame.watch_` returns."""
+        way, rate = change(0.1 * self._k, 4.0, 4.5)
+        before, self._heading = self._heading, self._by * LANE * rate / self.speed
+        self._k += 1
+        y = LANE * (self.lanes - self._by * way) - self._heading * self.ahead
+        return self.drive.scan(
+            self.slots, np.column_stack([self.ahead, y + self._rng.normal(0.0, 0.1, 4)]),
+            speed=self.speed if self._known else NAN,
+            yaw_rate=(self._heading - before) / 0.1 if self._known else NAN, speeds=False,
+        )  # fmt: skip
+
+    @property
+    def offset(self) -> float:
+        """Of the ego from the middle of the lane that it was in at first [m]."""
+        return self._by * LANE * change(0.1 * (self._k - 1), 4.0, 4.5)[0]
 
 
-@pytest.mark.parametrize("lost", [False, True])
-@settings(max_examples=15)
-@given(
-    st.integers(0, 2**32 - 1),
-    st.sampled_from([0.0041, 0.0497, 0.2603, 0.6208, 0.9304]),
-    st.sampled_from([0.01, 0.1, 0.5]),
-)
-def test_the_present_is_the_past_moved_on(
-    lost: bool, seed: int, hindsight: float, longest: float
-) -> None:
-    """However many scans there are in the hindsight; now and then the ego's motion is lost."""
-    rng = np.random.default_rng(seed)
-    par = parameters(hindsight=hindsight)
-    traffic, diary = Traffic(par, capacity=4), Diary(par, hindsight)
-    x, lanes = np.array([30.0, 45.0, 60.0, 90.0]), np.array([-1.0, 0.0, 1.0, 2.0])
-    speed, yaw_rate, passed = 28.0, 0.01, 0.0
-    for _ in range(150):
-        dt = longest if longest == 0.01 else round(rng.uniform(0.02, longest), 3)
-        if rng.random() < 0.05:
-            speed = NAN if lost and rng.random() < 0.5 else rng.uniform(0.0, 40.0)
-            yaw_rate = rng.normal(0.0, 0.02)
-            changing = rng.uniform(0.0, 1.0, 4)
-            traffic.objects["mu"][:, KEEP], traffic.objects["mu"][:, LEFT] = 1 - changing, changing
-            traffic.age[rng.integers(0, 4)] = 0
-        seen = np.flatnonzero(rng.random(4) < 0.8)
-        y = 3.5 * lanes + rng.normal(0.0, 0.1, 4)
-        note = np.zeros((1, 4), guides.NOTE_DTYPE)
-        note["seen"][0, seen] = True
-        age = traffic.age.copy()
-        age[seen] += 1
-        note["new"] = age <= 1
-        note["x"], note["y"], note["noise"] = x, y, 0.1**2
-        note["changing"] = traffic.objects["mu"][:, LEFT]
-        moved = traffic.scan(
-            seen, np.column_stack([x, y])[seen], dt=dt, speed=speed, yaw_rate=yaw_rate
-        )
-        passed += dt
-        present, P = diary.scan(passed, speed, yaw_rate, note)
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("known", [True, False])
+def test_the_ego_is_in_the_next_lane_once_it_is_nearer_to_it(side: int, known: bool) -> None:
+    """It is told once, and everybody's lane has another number from then on; they keep theirs."""
+    ego = EgoChange(side, known)
+    drive = ego.drive
+    ids = np.array([7, 8, FREE, 9, FREE, 10], np.int32)
+    reports = np.zeros(6, REPORT_DTYPE)
+    told, at, p, seen = 0, NAN, [], []
+    for k in range(120):
+        drive.objects["mean"][:, 2] = drive.objects["x"][:, 1, 2] = 0.7
+        moved = ego.scan()
+        shift = 0.7 - moved * drive.width
+        np.testing.assert_allclose(drive.objects["mean"][:, 2], shift)
+        np.testing.assert_allclose(drive.objects["x"][:, 1, 2], shift)
         if moved:
-            width = present[road.WIDTH]
-            guides.change_lane_(diary.x, diary.P, diary.slots, moved, width)
-            guides.change_lane_(present, P, diary.slots, moved, width)
-        np.testing.assert_allclose(traffic.frame.x, present, rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(traffic.frame.P, P, rtol=1e-6, atol=1e-12)
-        if diary.learnt:
-            np.testing.assert_allclose(traffic.x, diary.x, rtol=1e-6, atol=1e-9)
-        np.testing.assert_array_equal(traffic.guide_slot, diary.slots)
+            assert told == 0
+            told, at = moved, ego.offset
+        assert abs(drive.offset) <= 0.5 * drive.width
+        seen.append(drive.offset + told * drive.width - ego.offset)
+        assert lanes_of(drive, ego.slots) == pytest.approx((ego.lanes - told).tolist(), abs=0.1)
+        reports["p"] = 0.0
+        reports["p"][:, KL] = 1.0
+        drive.frame.judge_(ids, reports, drive.t_ns)
+        if k > 5:
+            p.append(reports["p"][:4, LC].max())
+    assert told == side
+    assert at * side == pytest.approx(0.5 * LANE, abs=0.5)
+    assert max(p) < 0.3
+    assert np.abs(seen).max() < (0.5 if known else 1.0)
+    assert np.abs(seen[-20:]).max() < 0.25
 
 
-def test_hindsight_reaches_back_no_further_than_there_is_room() -> None:
-    """At 100 Hz, with a hindsight of more scans than are kept, the oldest is learnt from early."""
-    traffic = Traffic(parameters(hindsight=2.0))
-    for k in range(3 * SCANS):
-        assert (traffic.guide_slot == 0).any() == (k >= SCANS)
-        traffic.scan([0], [[40.0, 0.5]], dt=0.01, speed=30.0, yaw_rate=0.0)
-    assert traffic.x[road.N_ROAD] < 1.0
-    # what is learnt from is the oldest scan that is kept, and not the newest in its place
-    traffic.scan([0], [[40.0, 3.5]], dt=0.01, speed=30.0, yaw_rate=0.0)
-    for _ in range(SCANS - 2):
-        traffic.scan([0], [[40.0, 0.5]], dt=0.01, speed=30.0, yaw_rate=0.0)
-        assert traffic.x[road.N_ROAD] < 1.0
-    traffic.scan([0], [[40.0, 0.5]], dt=0.01, speed=30.0, yaw_rate=0.0)
-    assert traffic.x[road.N_ROAD] > 2.5
-
-
-def test_when_nothing_moves_it_does_not_matter_when_it_is_learnt() -> None:
-    roads = []
-    xy = [[60.0, -3.3], [20.0, 0.3], [40.0, 3.9], [30.0, -3.3]]
-    for hindsight in (1e-9, 0.05, 0.5, 2.0):
-        traffic = Traffic(parameters(hindsight=hindsight))
-        for _ in range(300):
-            assert traffic.scan(range(4), xy, speed=0.0, yaw_rate=0.0) == 0
-        x = traffic.frame.x
-        ahead = road.lane_middles(np.tile(x, (3, 1)), np.array([0.0, 30.0, 60.0]))
-        roads.append([*ahead, traffic.width, traffic.offset])
-    np.testing.assert_allclose(roads[1:], np.tile(roads[0], (3, 1)), atol=0.02)
-    assert roads[0][-2] == pytest.approx(3.6, abs=0.05)
-    assert roads[0][1] == pytest.approx(0.3, abs=0.1)
-
-
-@pytest.mark.parametrize(("speed", "yaw_rate"), [(NAN, NAN), (30.0, NAN), (NAN, 0.02)])
-@pytest.mark.parametrize("dt", [0.1, 0.07, 0.013])
-def test_without_the_egos_motion_it_is_learnt_at_once(
-    speed: float, yaw_rate: float, dt: float
+@pytest.mark.parametrize("side", [1, -1])
+def test_another_lane_of_the_ego_changes_numbers_and_nothing_else(
+    side: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also what has been waiting, in the first such scan."""
-    xy = [[30.0, 0.5]]
-    traffic = Traffic(parameters())
-    traffic.scan([0], xy, dt=dt, speed=speed, yaw_rate=yaw_rate)
-    assert traffic.guide_slot[0] == 0
-    for waiting in range(12):
-        traffic = Traffic(parameters())
-        for _ in range(waiting):
-            traffic.scan([0], xy, dt=dt, speed=30.0, yaw_rate=0.0)
-        traffic.scan([0, 1], [*xy, [50.0, 3.5]], dt=dt, speed=speed, yaw_rate=yaw_rate)
-        assert traffic.guide_slot[:2].tolist() == [0, 1]
-        np.testing.assert_array_equal(traffic.frame.x, traffic.x[: road.N_ROAD])
-        np.testing.assert_array_equal(traffic.frame.P, traffic.P[: road.N_ROAD, : road.N_ROAD])
+    """Lane k of those before is lane k - 1, or k + 1, of those now, and as well known."""
+    ego = EgoChange(side)
+    frames: list[RoadFrame] = []
+    count = RoadFrame._change_lane
 
+    def remember(self: RoadFrame, bank: Any, objects: Any, moved: int) -> None:
+        frames.append(copy.deepcopy(self))
+        count(self, bank, objects, moved)
 
-def test_without_lateral_speeds_it_is_learnt_at_once() -> None:
-    """Such a radar shows lane changes too late for any hindsight."""
-    for speeds in (True, False):
-        traffic = Traffic(parameters())
-        for k in range(3):
-            xy = [[30.0, 0.5], [50.0, 3.5]]
-            traffic.scan([0, 1], xy, speed=30.0, yaw_rate=0.0, speeds=speeds)
-            assert (traffic.guide_slot[:2].tolist() == [0, 1]) == (not speeds)
-            assert (traffic.x[road.WAY] == 3.0 * k) == (not speeds or k == 0)
-
-
-@pytest.mark.parametrize("offset", [1.9, -1.9])
-@pytest.mark.parametrize("hindsight", [0.05, 0.5])
-def test_past_and_present_count_the_lanes_alike(offset: float, hindsight: float) -> None:
-    """When the ego is nearer to the next lane; all objects count from there, too."""
-    traffic = Traffic(parameters(hindsight=hindsight))
-    side = 1 if offset > 0 else -1
-    xy = [[30.0, 0.0], [50.0, 3.5]]
-    for _ in range(10):
-        traffic.scan([0, 1], xy, speed=25.0, yaw_rate=0.0)
-    places = slice(road.N_ROAD, road.N_ROAD + 2)
-    traffic.x[road.OFFSET] += offset
-    traffic.x[places] += offset  # the vehicles are seen where they were
-    past = traffic.x.copy()
-    traffic.objects["mean"][:, 2] = traffic.objects["x"][:, 1, 2] = 0.7
-    frame = copy.deepcopy(traffic.frame)
-    frame.move(traffic.t_ns + S // 10, 25.0, 0.0)
-    present = frame.x.copy()
-    lanes = traffic.frame._changes["log_w"][:2].argmax(axis=1)
-    assert traffic.scan([0, 1], xy, speed=25.0, yaw_rate=0.0) == side
-    width = traffic.width
-    seen = traffic.frame._changes["log_w"][:2].argmax(axis=1)
-    np.testing.assert_array_equal(seen, lanes - side)
-    np.testing.assert_allclose(traffic.objects["mean"][:, 2], 0.7 - side * width)
-    np.testing.assert_allclose(traffic.objects["x"][:, 1, 2], 0.7 - side * width)
-    assert traffic.offset == pytest.approx(present[road.OFFSET] - side * width, abs=1e-9)
-    assert traffic.x[road.OFFSET] == pytest.approx(past[road.OFFSET] - side * width, abs=0.05)
-    np.testing.assert_allclose(traffic.x[places], past[places] - side * width, atol=0.05)
-    before = traffic.offset
-    assert traffic.scan([0, 1], xy, speed=25.0, yaw_rate=0.0) == 0
-    assert traffic.offset == pytest.approx(before, abs=0.3)
+    monkeypatch.setattr(RoadFrame, "_change_lane", remember)
+    lanes: list[float] = []
+    while not ego.scan():
+        lanes = lanes_of(ego.drive, ego.slots)
+    (before,), now = frames, ego.drive.frame
+    assert before.width == now.width
+    assert lanes_of(ego.drive, ego.slots) == pytest.approx([k - side for k in lanes], abs=0.01)
+    for x in (0.0, 40.0, 120.0):
+        for k in (-1, 0, 2):
+            places, variances = [], []
+            for frame, lane in ((before, k), (now, k - side)):
+                h = np.zeros(road.N_ROAD + 1)
+                road.lane_row_(h, frame.x[road.WAY], x)
+                h[road.WIDTH] = lane
+                places.append(road.value(frame.x, h))
+                variances.append(road.variance(frame.P, h))
+            assert places[1] == pytest.approx(places[0], abs=1e-9)
+            # hypotheses that differ by the width are not told apart to the last digit
+            assert variances[1] == pytest.approx(variances[0], rel=1e-3)
+    t = ego.drive.t_ns * 1e-9
+    np.testing.assert_array_equal(now.changing(t), before.changing(t))
 
 
 # ---- into the road's axes and back
 
 
 def test_what_the_bus_stops_telling_is_forgotten() -> None:
-    traffic = driven(5.0)
-    frame = traffic.frame
+    drive = driven(5.0)
+    frame = drive.frame
     scan = Scan(1)
     scan.n, scan.valid[0], scan.z[0] = 1, True, (40.0, 0.0, 3.5, 0.0)
     for speed, expected in ((30.0, True), (NAN, False)):
-        traffic.nothing(speed=speed, yaw_rate=0.02)
+        drive.nothing(speed=speed, yaw_rate=0.02)
         z, r = scan.z.copy(), np.full((1, 4), 0.01)
         frame.localise_(scan, z, r)
         assert (z[0, 2] != scan.z[0, 2]).all()
@@ -348,6 +305,24 @@ def test_reports_go_back_to_the_sensors_axes() -> None:
     assert reports["ego_speed"].tolist() == [30.0, 30.0, 0.0]
 
 
+def test_errors_that_last_count_across_the_line_of_sight() -> None:
+    """They add to the variance of y, and of nothing else; the road's own error does as well."""
+    frame = driven(5.0).frame
+    scan = Scan(2)
+    scan.n, scan.valid[:] = 2, True
+    scan.z[:] = (40.0, 0.0, 3.5, 0.0)
+    added = []
+    for lasting in (0.0, 0.4):
+        scan.lasting[:] = 0.0, lasting
+        z, r = scan.z.copy(), np.full((2, 4), 0.01)
+        frame.localise_(scan, z, r)
+        np.testing.assert_array_equal(z[0], z[1])
+        assert (r[:, 2:] > 0.01).all()
+        added.append(r[1] - r[0])
+    np.testing.assert_array_equal(added[0], 0.0)
+    np.testing.assert_allclose(added[1], [0.0, 0.0, 0.4**2, 0.0], atol=1e-12)
+
+
 # ---- who changes lanes
 
 LC, KL = Manoeuvre.LANE_CHANGE, Manoeuvre.KEEP_LANE
@@ -356,14 +331,14 @@ OTHERS = [m for m in RELATIVE if m != LC]
 SHARES = st.floats(0.0, 1.0)
 
 
-def judged(p: Any, change: tuple[float, float], vx: float = 0.0, direction: int = 1) -> Any:
+def judged(p: Any, sides: tuple[float, float], vx: float = 0.0, direction: int = 1) -> Any:
     """The report that is made of one with these probabilities."""
     reports = np.zeros(2, REPORT_DTYPE)
     reports["p"] = p
     reports["x"][:, 1] = vx
     reports["direction"] = direction
     untouched = reports.copy()
-    judge_changes_(np.array([change, change]), reports, 1)
+    judge_changes_(np.array([sides, sides]), reports, 1)
     for name in REPORT_DTYPE.names or ():
         np.testing.assert_array_equal(reports[name][1], untouched[name][1], "only the first n")
     return reports[0]
@@ -427,8 +402,8 @@ def test_of_whom_nothing_is_known_the_modes_have_their_say() -> None:
 def test_vehicles_are_followed_in_the_axes_of_the_road(side: int, angle: float) -> None:
     """In a bend that the ego and all others drive, up to 10 m to the side of where it looks; one of
     them leaves its lane to the outside."""
-    curvature, speed = 0.002 * side, 30.0
-    traffic = Traffic(parameters(), capacity=6)
+    bent, speed = 0.002 * side, 30.0
+    drive = Traffic(parameters(), capacity=6)
     ids = np.array([7, 8, FREE, 9, 10, 11], np.int32)
     reports = np.zeros(6, REPORT_DTYPE)
     first = np.array([80.0, 85.0, 90.0, 95.0, 100.0])
@@ -437,17 +412,15 @@ def test_vehicles_are_followed_in_the_axes_of_the_road(side: int, angle: float) 
     for k in range(140):
         u = min(max((0.1 * k - 10.0) / 4.0, 0.0), 1.0)
         x = first - 0.4 * k
-        y = 3.5 * lanes + 0.5 * curvature * x**2
+        y = 3.5 * lanes + 0.5 * bent * x**2
         y[2] -= side * 3.5 * u * u * (3.0 - 2.0 * u)
-        # its modes know, too, so that it does not guide
-        traffic.objects["mu"][3, [KEEP, LEFT]] = float(u == 0.0), float(u > 0.0)
-        traffic.scan(
+        drive.scan(
             [0, 1, 3, 4, 5], np.column_stack([x, y]),
-            speed=speed, yaw_rate=curvature * speed, angle=angle, speeds=False,
+            speed=speed, yaw_rate=bent * speed, angle=angle, speeds=False,
         )  # fmt: skip
         reports["p"] = 0.0
         reports["p"][:, [KL, LC]] = 0.5
-        traffic.frame.judge_(ids, np.zeros(len(ids), MEMORY_DTYPE), reports, traffic.t_ns)
+        drive.frame.judge_(ids, reports, drive.t_ns)
         said.append(reports[:5].copy())
     p = np.array(said)["p"][:, :, LC]
     keepers = [0, 1, 3, 4]
@@ -458,98 +431,261 @@ def test_vehicles_are_followed_in_the_axes_of_the_road(side: int, angle: float) 
     assert turned["manoeuvre"] == LC
     assert turned["direction"] == -side
     # told by slot of a time that has passed
-    then = traffic.frame.changing(12.0)
+    then = drive.frame.changing(12.0)
     assert then[3, 0 if side < 0 else 1] > 0.99
     assert np.nanmax(then[[0, 1, 4, 5]]) < 0.1
     assert np.isnan(then[2]).all(), "nobody is there"
-    assert np.isnan(traffic.frame.changing(0.05)).all(), "before the first scan"
+    assert np.isnan(drive.frame.changing(0.05)).all(), "before the first scan"
 
 
-# ---- how far the road is known
+# ---- the past
 
 
-def doubted(frame: RoadFrame, ids: Any, memory: Any, reports: Any) -> None:
-    doubt_(frame.x, frame.P, 0.5, 30.0, np.zeros(road.N_ROAD + 1), ids, memory, reports)
+def one_leaves(t: float) -> list[list[float]]:
+    """Three vehicles, of which the second changes to the left from second 3 on within 4 s."""
+    return [[30.0, -LANE], [45.0, LANE * change(t, 3.0, 4.0)[0]], [60.0, LANE]]
 
 
-def lane_changes(p: float) -> np.ndarray[Any, Any]:
-    """At 20 to 150 m, as fast as the ego but for the second and the third."""
-    reports = np.zeros(4, REPORT_DTYPE)
-    reports["x"] = [(20, 0.5, 0, 1.8), (90, -2, 0, -0.9), (90, 2, 0, 0.9), (150, 0, 0, 0.05)]
-    reports["p"][:, LC], reports["p"][:, KL] = p, 1.0 - p
-    reports["manoeuvre"], reports["second"], reports["direction"] = LC, KL, -1
-    return reports
+def test_a_lane_change_is_seen_to_have_begun_before_it_was_said() -> None:
+    """Asked about the same moment, the filter says more of it the more it has seen."""
+    drive = Traffic(parameters(), capacity=5)
+    at_once, later = [], []
+    for k in range(60):
+        drive.scan([0, 2, 4], one_leaves(0.1 * k), speed=28.0, yaw_rate=0.0, speeds=False)
+        at_once.append(drive.changing(2))
+        later.append(drive.frame.changing((drive.t_ns - 8 * S // 10) * 1e-9)[2])
+    left, later_left = np.array(at_once)[:, 0], np.array(later)[8:, 0]
+    assert np.isnan(np.array(later)[:8]).all(), "nothing was seen then"
+    # one row each for the same moment
+    left = left[: len(later_left)]
+    t = 0.1 * np.arange(len(left))
+    assert later_left[t < 2.5].max() < 0.1
+    begun = [t[np.argmax(one > 0.5)] for one in (left, later_left)]
+    assert begun[0] - begun[1] > 0.35
+    assert begun[1] == pytest.approx(3.4, abs=0.3)
+    told = drive.frame.changing(drive.t_ns * 1e-9)
+    assert np.isnan(told[[1, 3]]).all(), "nobody is there"
+    assert np.nanmax(told[[0, 4]]) < 0.1
 
 
-@pytest.mark.parametrize("way", [0.0, 20.0])
-def test_lane_changes_are_trusted_no_further_than_the_road_is_known(way: float) -> None:
-    """A road that bends unseen explains a lateral speed by the uncertainty of its direction, and
-    that times the vehicle's speed; of the direction by quadrature of the bends."""
-    frame = driven(3.0).frame
-    frame.x[road.WAY] = way
-    frame.P /= 25.0
-    reports = lane_changes(0.8)
-    doubted(frame, np.arange(4, dtype=np.int32), np.zeros(4, MEMORY_DTYPE), reports)
-    knots = road.SPACING * np.arange(road.N_KNOTS)
-    shares = []
-    for x, vx, _, vy in lane_changes(0.8)["x"].tolist():
-        u = way + (np.arange(20000) + 0.5) * x / 20000
-        h = np.zeros(road.N_ROAD)
-        h[[road.HEADING, road.MOUNTING]] = -1.0
-        for i in range(road.N_KNOTS):
-            h[road.KNOT + i] = np.interp(u, knots, np.eye(road.N_KNOTS)[i]).mean() * x
-        std = math.hypot(WANDER_SPEED, (30.0 + vx) * math.sqrt(h @ frame.P @ h))
-        shares.append(1.0 / (1.0 + 0.5 * math.sqrt(2.0 * math.pi) * norm.pdf(vy, 0.0, std)))
-    assert shares[0] > 0.9
-    assert shares[3] < 0.7
-    rest = [KL, int(Manoeuvre.APPROACHING), int(Manoeuvre.RECEDING), KL]
-    expected = np.zeros_like(reports["p"])
-    expected[:, KL] = 0.2
-    expected[np.arange(4), rest] += 0.8 * (1.0 - np.array(shares))
-    expected[:, LC] = 0.8 * np.array(shares)
-    np.testing.assert_allclose(reports["p"], expected, rtol=1e-4, atol=1e-9)
-    np.testing.assert_array_equal(reports["manoeuvre"], expected[:, 1:].argmax(axis=1) + 1)
-    assert (reports["direction"] == np.where(reports["manoeuvre"] == LC, -1, 0)).all()
-    assert len(set(reports["manoeuvre"].tolist())) > 1, "some were doubted away, some not"
+def test_of_the_present_moment_it_is_what_is_said() -> None:
+    """In the reports of the slots in use, in their order, and with the times of the change."""
+    drive = Traffic(parameters(), capacity=5)
+    ids = np.array([11, FREE, 12, FREE, 13], np.int32)
+    for k in range(52):
+        drive.scan([0, 2, 4], one_leaves(0.1 * k), speed=28.0, yaw_rate=NAN, speeds=False)
+    reports = np.zeros(5, REPORT_DTYPE)
+    reports["p"][:, KL] = 1.0
+    untouched = reports.copy()
+    drive.frame.judge_(ids, reports, drive.t_ns)
+    known = drive.frame.changing(drive.t_ns * 1e-9)[[0, 2, 4]]
+    np.testing.assert_allclose(reports["p"][:3, LC], known.sum(axis=1), atol=1e-12)
+    assert reports["manoeuvre"][:3].tolist() == [KL, LC, KL]
+    assert reports["direction"][:3].tolist() == [0, 1, 0]
+    assert np.isnan(reports["change"][[0, 2]]).all()
+    # the first scan is at 0.1 s
+    assert reports["change"][1] == pytest.approx([3.1, 7.1], abs=0.6)
+    for name in REPORT_DTYPE.names or ():
+        np.testing.assert_array_equal(reports[name][3:], untouched[name][3:])
 
 
-def test_what_is_hardly_a_lane_change_and_what_nobody_is_in_is_not_doubted() -> None:
-    frame = driven(3.0).frame
-    for p, first in ((0.009, 0), (0.8, FREE)):
-        reports = lane_changes(p)
-        ids = np.full(4, first, np.int32)
-        doubted(frame, ids, np.zeros(4, MEMORY_DTYPE), reports)
-        np.testing.assert_array_equal(reports, lane_changes(p))
+# ---- nothing to be seen, nothing known, and the same again
 
 
-def test_a_lane_change_that_was_trusted_stays_so_until_it_is_over() -> None:
-    """It ends slowly, and then looks like a bend; another one is to be trusted anew."""
-    frame = driven(3.0).frame
-    ids, memory = np.array([FREE, 7], np.int32), np.zeros(2, MEMORY_DTYPE)
+def test_a_scan_of_nothing() -> None:
+    """Of the first one, and of some amid the traffic."""
+    drive = Traffic(parameters(), capacity=3)
+    ids, reports = np.full(3, FREE, np.int32), np.zeros(3, REPORT_DTYPE)
+    assert drive.scan([], [], speed=28.0, yaw_rate=0.0) == 0
+    drive.frame.judge_(ids, reports, drive.t_ns)
+    drive.frame.globalise_(reports, 0)
+    assert reports.tobytes() == np.zeros(3, REPORT_DTYPE).tobytes()
+    assert drive.frame.changing(0.1).shape == (3, 2)
+    assert np.isnan(drive.frame.changing(0.1)).all()
+    places = [[30.0, 0.1], [45.0, 3.4]]
+    drive.scan([0, 2], places, speed=28.0, yaw_rate=0.0)
+    for _ in range(4):
+        drive.scan([0, 2], places, speed=28.0, yaw_rate=0.0)
+        for seconds, followed in ((0.1, True), (0.9, True), (1.1, False)):
+            later = copy.deepcopy(drive)
+            for _ in range(round(10 * seconds)):
+                assert later.scan([], [], speed=28.0, yaw_rate=0.0) == 0
+            assert (later.guide_of[[0, 2]] >= 0).all() == followed
+            assert np.isfinite(later.frame.x).all()
+            assert np.isnan(later.changing(0)).all() == (not followed)
 
-    def trusted(vy: float, p: float = 0.8) -> float:
-        reports = lane_changes(p)[:1]
-        reports["x"][0, 3], reports["age"] = vy, 5
-        doubted(frame, ids, memory, reports)
-        return float(reports["p"][0, LC] / p)
 
-    at_first = trusted(0.05)
-    assert at_first < 0.5
-    fast = trusted(1.8)
-    assert fast > 0.9
-    assert trusted(0.05) == pytest.approx(fast)
-    trusted(0.05, p=0.1)
-    assert trusted(0.05) == pytest.approx(at_first)
+class Random:
+    """A long drive past many: they come and go and change lanes; the ego does, too, on a road that
+    winds, and what the bus tells of it is lost now and then."""
+
+    def __init__(self, seed: int, capacity: int = 12) -> None:
+        self.drive = Traffic(parameters(), capacity)
+        self._rng = rng = np.random.default_rng(seed)
+        self._x = rng.uniform(5.0, 200.0, capacity)
+        self._there = np.ones(capacity, np.bool_)
+        # by vehicle, and last the ego: the lane, and the next one from when on
+        self._lane = np.append(rng.integers(-2, 3, capacity), 0)
+        self._next, self._from = self._lane.copy(), np.full(capacity + 1, -9.0)
+        self._bend, self._wave = rng.uniform(0.0, 6e-4), 1.0 / rng.uniform(100.0, 300.0)
+        self._s, self._t, self._heading, self._speed = 0.0, 0.0, 0.0, 30.0
+        self._lost, self.lane = 0, 0.0
+
+    def _road(self, x: Any) -> Any:
+        """Where it is x ahead, if it winds like a sine."""
+        at, across = self._wave * self._s, self._bend / self._wave
+        return across * (
+            x * math.cos(at) - (np.sin(at + self._wave * x) - math.sin(at)) / self._wave
+        )
+
+    def scan(self) -> int:
+        """The next one; what `RoadFrame.watch_` returns."""
+        rng, n = self._rng, len(self._x)
+        dt = float(rng.choice([0.02, 0.07, 0.1, 0.1, 0.3]))
+        self._t += dt
+        self._s += self._speed * dt
+        self._speed = float(np.clip(self._speed + rng.normal(0.0, 0.5) * dt, 20.0, 40.0))
+        begins = (rng.random(n + 1) < 0.03 * dt) & (self._t - self._from > 6.0)
+        self._lane[begins], self._from[begins] = self._next[begins], self._t
+        aside = np.clip(self._lane + rng.choice([-1, 1], n + 1), [-2] * n + [-1], [2] * n + [1])
+        self._next[begins] = aside[begins]
+        ways = [change(self._t, begin, 4.5) for begin in self._from]
+        lanes = self._lane + (self._next - self._lane) * np.array(ways)[:, 0]
+        self.all_lanes = lanes
+        self.lane, before = lanes[-1], self._heading
+        self._heading = LANE * (self._next - self._lane)[-1] * ways[-1][1] / self._speed
+        others = rng.random(n) < 0.03 * dt
+        self.drive.age[others] = 0
+        self._x[others] = rng.uniform(5.0, 200.0, n)[others]
+        self._there ^= rng.random(n) < 0.2 * dt
+        if rng.random() < 0.1 * dt:
+            self._lost = int(rng.integers(4))
+        seen = np.flatnonzero(self._there)
+        x = self._x[seen]
+        y = LANE * (lanes[seen] - self.lane) - self._heading * x + self._road(x)
+        turning = self._bend * self._speed * math.sin(self._wave * self._s)
+        turning += (self._heading - before) / dt
+        return self.drive.scan(
+            seen, np.column_stack([x, y + rng.normal(0.0, 0.15, len(seen))]), dt=dt,
+            speed=NAN if self._lost in (1, 3) else self._speed,
+            yaw_rate=NAN if self._lost in (2, 3) else turning, speeds=False,
+        )  # fmt: skip
 
 
-@pytest.mark.parametrize(("speeds", "speed"), [(True, 30.0), (False, 30.0), (True, NAN)])
-def test_only_measured_lateral_speeds_on_a_known_road_give_rise_to_doubt(
-    speeds: bool, speed: float
-) -> None:
-    traffic = Traffic(parameters())
-    for k in range(5):
-        traffic.scan([0], np.array([[60.0 - k, 0.0]]), speed=speed, yaw_rate=0.0, speeds=speeds)
-    assert traffic.frame.doubtful == (speeds and speed == 30.0)
+KEPT = ("x", "P", "n", "n_global", "log_w", "choice", "rest", "mean", "odds")
+"""Of the filter."""
+
+
+def assert_is_covariance(P: Any) -> None:
+    """Symmetric, and positive but for what is known without a doubt and for rounding."""
+    assert np.isfinite(P).all()
+    np.testing.assert_allclose(P, P.T, rtol=1e-11, atol=1e-18)
+    known = P.diagonal() == 0.0
+    assert not P[known].any()
+    std = np.sqrt(P.diagonal()[~known])
+    correlation = P[np.ix_(~known, ~known)] / np.outer(std, std)
+    assert np.linalg.eigvalsh(correlation).min() > -1e-9
+
+
+@settings(max_examples=5)
+@given(st.integers(0, 2**32 - 1))
+def test_after_a_long_drive_the_covariance_is_still_one(seed: int) -> None:
+    """Of the road, and of the road and all vehicles together."""
+    drive = Random(seed)
+    frame, T = drive.drive.frame, drive.drive.filter
+    moved = 0
+    for k in range(600):
+        moved += abs(drive.scan())
+        if k % 20 and k < 580:
+            continue
+        top = int(T["top"])
+        assert_is_covariance(T["P"][:top, :top])
+        assert not T["P"][top:].any()
+        assert_is_covariance(frame.P)
+        assert np.isfinite(frame.x).all()
+        assert 0.0 <= frame.x[road.WAY] < road.SPACING
+        assert abs(frame.x[road.OFFSET]) <= 0.5 * frame.width
+        assert 2.5 < frame.width < 4.5
+        p = frame.changing(drive.drive.t_ns * 1e-9)
+        known = drive.drive.guide_of != traffic.FREE
+        assert np.isnan(p[~known]).all()
+        assert p[known].min() >= 0.0
+        assert p[known].sum(axis=1).max() <= 1.0 + 1e-9
+    assert moved > 0
+
+
+def test_the_same_scans_say_the_same_bit_for_bit() -> None:
+    """Of two filters, and of one copied on the way."""
+    one, two = Random(3), Random(3)
+    for k in range(300):
+        if k == 150:
+            two = copy.deepcopy(one)
+        assert one.scan() == two.scan()
+        t = one.drive.t_ns * 1e-9
+        for a, b in (
+            *((one.drive.filter[name], two.drive.filter[name]) for name in KEPT),
+            (one.drive.frame.x, two.drive.frame.x),
+            (one.drive.frame.P, two.drive.frame.P),
+            (one.drive.frame.changing(t), two.drive.frame.changing(t)),
+        ):
+            assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_second_track_of_a_vehicle_is_said_to_do_the_same(swapped: bool) -> None:
+    """Whichever slot the older one has; the road is the same as without the second."""
+    alone, both = Traffic(parameters(), capacity=5), Traffic(parameters(), capacity=5)
+    older, twin = (3, 0) if swapped else (0, 3)
+    ids = np.array([7, 8, FREE, 9, 10], np.int32)
+    reports = np.zeros(5, REPORT_DTYPE)
+    for k in range(60):
+        at = one_leaves(0.1 * k)
+        alone.scan([1, older, 4], at, speed=28.0, yaw_rate=0.0, speeds=False)
+        second = [[at[1][0] + 1.5, at[1][1] + 0.3]] if k >= 10 else []
+        slots = [1, older, 4, twin][: 3 + len(second)]
+        both.scan(slots, [*at, *second], speed=28.0, yaw_rate=0.0, speeds=False)
+        np.testing.assert_array_equal(both.frame.x, alone.frame.x)
+        np.testing.assert_array_equal(both.frame.P, alone.frame.P)
+        if not second:
+            continue
+        reports["p"] = 0.0
+        reports["p"][:, KL] = 1.0
+        both.frame.judge_(ids, reports, both.t_ns)
+        # rows of the slots 0 and 3
+        for name in ("p", "manoeuvre", "direction", "change"):
+            np.testing.assert_array_equal(reports[name][0], reports[name][2])
+        if k == 50:
+            assert reports["manoeuvre"][:4].tolist() == [LC, KL, LC, KL]
+    assert (both.filter["party"]["slot"] != traffic.FREE).sum() == 3
+
+
+@pytest.mark.parametrize(("speed", "yaw_rate"), [(NAN, NAN), (28.0, NAN), (NAN, 0.0)])
+def test_what_is_said_without_the_egos_motion(speed: float, yaw_rate: float) -> None:
+    """Who changes lanes all the same; who approaches since the ego is faster is not known."""
+    drive = Traffic(parameters(), capacity=3)
+    ids, reports = np.array([7, 8, 9], np.int32), np.zeros(3, REPORT_DTYPE)
+    said = []
+    for k in range(110):
+        # at last it speeds up, as far as the bus tells
+        v = speed + 0.07 * max(k - 80, 0)
+        drive.scan([0, 1, 2], one_leaves(0.1 * k), speed=v, yaw_rate=yaw_rate, speeds=False)
+        reports["p"] = 0.0
+        reports["p"][:, KL] = 1.0
+        reports["x"][:, 1] = -0.4
+        drive.frame.judge_(ids, reports, drive.t_ns)
+        said.append(reports.copy())
+    told = np.array(said)
+    p, t = told["p"], 0.1 * np.arange(110)
+    assert p[(t > 4.8) & (t < 6.3), 1, LC].min() > 0.9
+    assert p[(t > 1.0) & (t < 3.0), 1, LC].max() < 0.1
+    assert p[t > 8.0, 1, LC].max() < 0.1
+    assert p[t > 1.0][:, [0, 2], LC].max() < 0.2
+    assert (told["direction"][told["manoeuvre"] == LC] == 1).all()
+    approach = p[:, 0, Manoeuvre.APPROACHING]
+    assert approach[t < 7.9].max() < 0.02
+    assert math.isnan(drive.frame.acceleration) == math.isnan(speed)
+    assert (approach[-1] > 0.5) == (not math.isnan(speed))
+    assert math.isnan(speed) == (not approach.any())
 
 
 # ---- the ego changes its speed

@@ -55,6 +55,8 @@ GATE = 25.0
 """Squared normalised error above which a vehicle is not where it was."""
 MAX_OUTLIERS = 4
 """After so many in a row it is another one."""
+FEW = 8
+"""Up to so many vehicles are followed as closely as can be."""
 CALM = 0.16
 """A vehicle that is less likely to change lanes shows how it wanders."""
 TWIN_AHEAD, TWIN_BESIDE = 3.0, 1.0
@@ -306,6 +308,7 @@ def watch_(
         gone = notes[s].seen and (notes[s].off > OFF or not SEEN_FROM < notes[s].x < SEEN_TO)
         if gone or notes[s].new or T.party[g].unseen > UNSEEN_S:
             leave_(T, guide_of, g)
+    apart = APART * max(1.0, (T.top - N_ROAD) / (2.0 * FEW))
     for k in range(n):
         s = slot[k]
         if s < 0 or not notes[s].seen or notes[s].off > OFF:
@@ -321,7 +324,7 @@ def watch_(
             g = meet_(T, par, guide_of, notes, s, t)
             if g == FREE:
                 continue
-        elif t - T.party[g].begun >= APART:
+        elif t - T.party[g].begun >= apart:
             begin_courses_(T, g, t, par, np.nan)
         party = T.party[g]
         party.unseen = 0.0
@@ -334,7 +337,7 @@ def watch_(
         if valid[k, 1] and valid[k, 3]:
             vx, vy, noise = velocity(z[k], r[k], angle[k])
             see_speed_(T, g, note.x, vx, vy, noise, v, t)
-    if t - T.party[EGO].begun >= APART:
+    if t - T.party[EGO].begun >= apart:
         begin_courses_(T, EGO, t, par, np.nan)
     consider_(T, t, par)
 

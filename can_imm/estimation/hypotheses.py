@@ -36,9 +36,9 @@ LOG_P: FloatArray = np.tile(_LOG_P - np.log(np.sum(np.exp(_LOG_P))), 2)
 such at a constant rate."""
 N_BEGUN = 6
 """Lane changes that had begun before a vehicle was first seen are tried from so many beginnings."""
-APART = 0.14
-"""Courses begin so long one after the other [s]."""
-IMPOSSIBLE = 13.0
+APART = 0.07
+"""Courses begin so long one after the other [s], and longer where many vehicles are followed."""
+IMPOSSIBLE = 13.5
 """What is less likely than the best by this, as a logarithm, is given up."""
 RARE = 7.0
 """What is less likely by this begins no courses."""

@@ -266,7 +266,7 @@ def test_who_is_seen_again_in_time_is_the_same() -> None:
     scan(traffic, {0: (40.0, 0.0)})
     party = traffic.filter["party"][0]
     assert party["unseen"] == 0.0
-    assert party["since"] == pytest.approx(0.2), "in its first scan it was new"
+    assert party["since"] == pytest.approx(0.1)
 
 
 def test_another_object_in_a_slot_is_another_vehicle() -> None:
