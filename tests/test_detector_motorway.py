@@ -238,7 +238,7 @@ def test_a_lane_change(start: int, side: int, flag: int, polar: bool) -> None:
     for k, reports in enumerate(said):
         t, report = 0.1 * k, reports[9]
         # without a lateral speed it takes longer to be seen
-        if (5.1 if polar else 4.6) <= t <= 5.6:
+        if (4.8 if polar else 4.4) <= t <= 6.5:
             assert report["manoeuvre"] == Manoeuvre.LANE_CHANGE
             assert report["direction"] == side
             assert report["flags"] & (CUT_IN | CUT_OUT) == flag
@@ -302,9 +302,7 @@ def test_the_egos_lane_change_is_not_theirs(side: int, known: bool) -> None:
         n = detector.step(s.t_ns, s)
         said.append({int(r["object_id"]): r.copy() for r in detector.reports[:n]})
     for name in FOUR:
-        told = says(said[10:], name)
-        wrong = told.count(Manoeuvre.LANE_CHANGE)
-        assert wrong <= (2 if known else 45)
+        assert Manoeuvre.LANE_CHANGE not in says(said[10:], name)
     for reports, shift in ((said[30], 0), (said[-1], side)):
         assert [int(reports[name]["lane"]) for name in FOUR] == [
             number - shift for number in (-1, 0, 1, 2)

@@ -534,9 +534,8 @@ class Random:
     def _road(self, x: Any) -> Any:
         """Where it is x ahead, if it winds like a sine."""
         at, across = self._wave * self._s, self._bend / self._wave
-        return across * (
-            x * math.cos(at) - (np.sin(at + self._wave * x) - math.sin(at)) / self._wave
-        )
+        bent = (np.sin(at + self._wave * x) - math.sin(at)) / self._wave
+        return across * (x * math.cos(at) - bent)
 
     def scan(self) -> int:
         """The next one; what `RoadFrame.watch_` returns."""
@@ -551,7 +550,6 @@ class Random:
         self._next[begins] = aside[begins]
         ways = [change(self._t, begin, 4.5) for begin in self._from]
         lanes = self._lane + (self._next - self._lane) * np.array(ways)[:, 0]
-        self.all_lanes = lanes
         self.lane, before = lanes[-1], self._heading
         self._heading = LANE * (self._next - self._lane)[-1] * ways[-1][1] / self._speed
         others = rng.random(n) < 0.03 * dt
@@ -589,14 +587,14 @@ def assert_is_covariance(P: Any) -> None:
 
 @settings(max_examples=5)
 @given(st.integers(0, 2**32 - 1))
-def test_after_a_long_drive_the_covariance_is_still_one(seed: int) -> None:
+def test_on_a_long_drive_the_covariance_stays_one_and_the_road_where_it_is(seed: int) -> None:
     """Of the road, and of the road and all vehicles together."""
     drive = Random(seed)
     frame, T = drive.drive.frame, drive.drive.filter
-    moved = 0
-    for k in range(600):
-        moved += abs(drive.scan())
-        if k % 20 and k < 580:
+    lanes = 0
+    for k in range(320):
+        lanes += drive.scan()
+        if k % 20:
             continue
         top = int(T["top"])
         assert_is_covariance(T["P"][:top, :top])
@@ -605,20 +603,20 @@ def test_after_a_long_drive_the_covariance_is_still_one(seed: int) -> None:
         assert np.isfinite(frame.x).all()
         assert 0.0 <= frame.x[road.WAY] < road.SPACING
         assert abs(frame.x[road.OFFSET]) <= 0.5 * frame.width
-        assert 2.5 < frame.width < 4.5
+        assert frame.width == pytest.approx(LANE, abs=0.3)
+        assert frame.x[road.OFFSET] == pytest.approx(LANE * (drive.lane - lanes), abs=1.2)
         p = frame.changing(drive.drive.t_ns * 1e-9)
         known = drive.drive.guide_of != traffic.FREE
         assert np.isnan(p[~known]).all()
         assert p[known].min() >= 0.0
         assert p[known].sum(axis=1).max() <= 1.0 + 1e-9
-    assert moved > 0
 
 
 def test_the_same_scans_say_the_same_bit_for_bit() -> None:
     """Of two filters, and of one copied on the way."""
-    one, two = Random(3), Random(3)
-    for k in range(300):
-        if k == 150:
+    one, two = Random(3, 6), Random(3, 6)
+    for k in range(160):
+        if k == 80:
             two = copy.deepcopy(one)
         assert one.scan() == two.scan()
         t = one.drive.t_ns * 1e-9
@@ -679,7 +677,7 @@ def test_what_is_said_without_the_egos_motion(speed: float, yaw_rate: float) -> 
     assert p[(t > 4.8) & (t < 6.3), 1, LC].min() > 0.9
     assert p[(t > 1.0) & (t < 3.0), 1, LC].max() < 0.1
     assert p[t > 8.0, 1, LC].max() < 0.1
-    assert p[t > 1.0][:, [0, 2], LC].max() < 0.2
+    assert p[t > 1.0][:, [0, 2], LC].max() < 0.3
     assert (told["direction"][told["manoeuvre"] == LC] == 1).all()
     approach = p[:, 0, Manoeuvre.APPROACHING]
     assert approach[t < 7.9].max() < 0.02

@@ -875,8 +875,8 @@ def test_the_covariance_follows_when_the_lanes_are_counted_anew() -> None:
 # ---- the ego's habits
 
 
-BESIDE_THE_MIDDLE = 0.2
-"""Where this ego is used to drive [m]."""
+HABITS = {"offset": 0.2, "offset_time": 1.2, "heading_time": 0.7, "turn_time": 1.0}
+"""Where this ego is used to drive, and for how long at a time: some scans are further apart."""
 
 
 def habits(
@@ -892,8 +892,8 @@ def habits(
         slope = bend = 0.0
     per = 1.0 if v == 0.0 else width / v
     return [
-        (heading, slope * per, 0.01**2 * max(2.0 / dt, 1.0)),
-        (offset, BESIDE_THE_MIDDLE + lane * width, 0.3**2 * max(8.0 / dt, 1.0)),
+        (heading, slope * per, 0.01**2 * max(0.7 / dt, 1.0)),
+        (offset, 0.2 + lane * width, 0.3**2 * max(1.2 / dt, 1.0)),
         *([] if math.isnan(yaw_rate) else [
             (turn, yaw_rate - bend * per, 0.01**2 * max(1.0 / dt, 1.0))
         ]),
@@ -912,7 +912,7 @@ EGOS = [
 def test_the_egos_habits(chosen: int, speed: float, yaw_rate: float, dt: float) -> None:
     """Like a filter that is told them, for each course that it may be on; whichever the chosen
     one is.  Up to what moves no mean."""
-    par = parameters(offset=BESIDE_THE_MIDDLE)
+    par = parameters(**HABITS)
     T = with_road(*road.new_road(par), par)
     put_(T, EGOS, [[chosen]], {})
     dense = [Dense(T["x"].copy(), T["P"]) for _ in EGOS]
