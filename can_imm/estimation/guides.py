@@ -45,7 +45,7 @@ SEEN_TO = 250.0
 SEEN_FROM = -50.0
 """Nor are those further behind [m]."""
 WIDTH_SEEN_TO, WIDTH_LANES = 100.0, 2
-"""Vehicles that are further away [m], or in a lane further aside, do not tell how wide the lanes are:
+"""Vehicles that are further away [m], or in a lane further aside, do not tell how wide lanes are:
 their lane is not sure enough."""
 UNSEEN_S = 1.0
 """A vehicle that was not seen for longer is forgotten [s]."""

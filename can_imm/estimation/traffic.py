@@ -204,9 +204,7 @@ def best_global(T: Any) -> int:  # pragma: no cover - compiled
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
-def seen(
-    h: FloatArray, at: Any, m: int, state: FloatArray
-) -> float:  # pragma: no cover - compiled
+def seen(h: FloatArray, at: Any, m: int, state: FloatArray) -> float:  # pragma: no cover - compiled
     """h[:m] times the states at[:m].  In four sums: one would wait for itself."""
     a = b = c = d = 0.0
     i = 0
