@@ -875,8 +875,12 @@ def test_the_covariance_follows_when_the_lanes_are_counted_anew() -> None:
 # ---- the ego's habits
 
 
-HABITS = {"offset": 0.2, "offset_time": 1.2, "heading_time": 0.7, "turn_time": 1.0}
-"""Where this ego is used to drive, and for how long at a time: some scans are further apart."""
+HABITS = {
+    "offset": 0.2, "offset_std": 1.2, "offset_time": 1.2,
+    "heading_std": 0.03, "heading_time": 0.7, "turn_std": 0.02, "turn_time": 1.0,
+}  # fmt: skip
+"""Where this ego is used to drive, how strictly, and for how long at a time: some scans are further
+apart."""
 
 
 def habits(
@@ -892,10 +896,10 @@ def habits(
         slope = bend = 0.0
     per = 1.0 if v == 0.0 else width / v
     return [
-        (heading, slope * per, 0.01**2 * max(0.7 / dt, 1.0)),
-        (offset, 0.2 + lane * width, 0.3**2 * max(1.2 / dt, 1.0)),
+        (heading, slope * per, 0.03**2 * max(0.7 / dt, 1.0)),
+        (offset, 0.2 + lane * width, 1.2**2 * max(1.2 / dt, 1.0)),
         *([] if math.isnan(yaw_rate) else [
-            (turn, yaw_rate - bend * per, 0.01**2 * max(1.0 / dt, 1.0))
+            (turn, yaw_rate - bend * per, 0.02**2 * max(1.0 / dt, 1.0))
         ]),
     ]  # fmt: skip
 
