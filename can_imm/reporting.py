@@ -203,8 +203,8 @@ def judge_changes_(p: FloatArray, reports: Any, n: int) -> None:
     The probability of what else they do stays as it is, but for the common factor.
 
     Args:
-        p: (n, 2) probabilities of changing to the left and to the right, see `estimation.changing`;
-            NaN where nothing is known: there the report is left alone.
+        p: (n, 2) probabilities of changing to the left and to the right, by
+            `estimation.hypotheses`; NaN where nothing is known: there the report is left alone.
     """
     for k in range(n):
         if p[k, 0] != p[k, 0]:

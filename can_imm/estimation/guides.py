@@ -78,14 +78,26 @@ variance of y [m²], and how probable it is that it is off the lanes."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def straightened(
+    along: float, across: float, r_along: float, r_across: float, angle: float
+) -> tuple[float, float, float]:  # pragma: no cover - compiled
+    """A vector from axes turned by an angle [rad] into the vehicle's: x, y, and the variance of y.
+
+    Args:
+        r_along, r_across: variances in the turned axes.
+    """
+    cos, sin = math.cos(angle), math.sin(angle)
+    x = along * cos - across * sin
+    y = along * sin + across * cos
+    return x, y, r_across * cos * cos + r_along * sin * sin
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def position(
     z: FloatArray, r: FloatArray, angle: float
 ) -> tuple[float, float, float]:  # pragma: no cover - compiled
     """x and y in the vehicle's axes [m], and the variance of y, of a row (4,) of a scan."""
-    cos, sin = math.cos(angle), math.sin(angle)
-    x = z[0] * cos - z[2] * sin
-    y = z[0] * sin + z[2] * cos
-    return x, y, r[2] * cos * cos + r[0] * sin * sin
+    return straightened(z[0], z[2], r[0], r[2], angle)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -93,10 +105,7 @@ def velocity(
     z: FloatArray, r: FloatArray, angle: float
 ) -> tuple[float, float, float]:  # pragma: no cover - compiled
     """vx and vy in the vehicle's axes [m/s], and the variance of vy, of a row (4,) of a scan."""
-    cos, sin = math.cos(angle), math.sin(angle)
-    vx = z[1] * cos - z[3] * sin
-    vy = z[1] * sin + z[3] * cos
-    return vx, vy, r[3] * cos * cos + r[1] * sin * sin
+    return straightened(z[1], z[3], r[1], r[3], angle)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

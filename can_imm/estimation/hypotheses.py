@@ -180,15 +180,19 @@ def alike(T: Any, p: int, q: int) -> bool:  # pragma: no cover - compiled
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def agree(T: Any, g: int, other: int, but: int) -> bool:  # pragma: no cover - compiled
+    """Whether two global hypotheses have courses alike for all parties but one (-1: for all)."""
+    for p in range(N_PARTIES):
+        if p != but and not alike(T, T.choice[other, p], T.choice[g, p]):
+            return False
+    return True
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def find_global(T: Any, g: int, who: int, q: int) -> int:  # pragma: no cover - compiled
     """The global hypothesis like g but for the course q of a party; -1 if there is none."""
     for other in range(T.n_global):
-        same = alike(T, T.choice[other, who], q)
-        p = 0
-        while same and p < N_PARTIES:
-            same = p == who or alike(T, T.choice[other, p], T.choice[g, p])
-            p += 1
-        if same:
+        if alike(T, T.choice[other, who], q) and agree(T, g, other, who):
             return other
     return -1
 
@@ -225,13 +229,8 @@ def split_(T: Any) -> None:  # pragma: no cover - compiled
                     to = one
             if T.log_w[to] >= value or to == g:
                 return
-        who = T.local[q].who
-        T.log_w[to] = T.log_w[g]
-        T.rest[to] = T.rest[g]
-        T.choice[to] = T.choice[g]
-        for p in range(T.n):
-            T.odds[to, p] = T.odds[g, p]
-        rechoose_(T, to, who, q)
+        copy_global_(T, g, to)
+        rechoose_(T, to, T.local[q].who, q)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -245,10 +244,7 @@ def drop_globals_(T: Any) -> None:  # pragma: no cover - compiled
         keep = T.log_w[g] >= -LATE
         other = 0
         while keep and other < kept:
-            same = True
-            for p in range(N_PARTIES):
-                same = same and alike(T, T.choice[other, p], T.choice[g, p])
-            if same:
+            if agree(T, g, other, -1):
                 keep = False
                 if T.log_w[g] > T.log_w[other]:
                     copy_global_(T, g, other)

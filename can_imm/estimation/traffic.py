@@ -26,6 +26,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from can_imm.estimation import lane_changes
 from can_imm.estimation.lane_changes import fading
 from can_imm.estimation.road import (
     BIAS,
@@ -143,13 +144,9 @@ def course(u: float, steady: bool) -> tuple[float, float, float]:  # pragma: no 
         return 0.0, 0.0, 0.0
     if u >= 1.0:
         return 1.0, 0.0, 0.0
-    if steady:
-        return u, 1.0, 0.0
-    u2, rest = u * u, 1.0 - u
-    quintic = u2 * u * (10.0 - 15.0 * u + 6.0 * u2)
-    cubic = u2 * (3.0 - 2.0 * u)
-    slope = 3.0 * u * rest * (5.0 * u * rest + 1.0)
-    return 0.5 * (quintic + cubic), slope, 3.0 * (1.0 - 2.0 * u) * (10.0 * u * rest + 1.0)
+    done, slope = lane_changes.course(u, steady)
+    bend = 0.0 if steady else 3.0 * (1.0 - 2.0 * u) * (10.0 * u * (1.0 - u) + 1.0)
+    return done, slope, bend
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
