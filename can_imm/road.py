@@ -172,7 +172,7 @@ class RoadFrame:
         summarise_(self._traffic, self.x, self.P)
         learn_habits_(
             self._traffic, self._par, self._guide_of, self._notes, self.x, self.P,
-            scan.t_ns * 1e-9, self._dt, self.speed, scan.n, slot, scan.z, r, scan.valid, scan.angle,
+            scan.t_ns * 1e-9, self.speed, scan.n, slot, scan.z, r, scan.valid, scan.angle,
         )  # fmt: skip
         moved = 0
         if abs(self.x[road.OFFSET]) > 0.5 * self.width:

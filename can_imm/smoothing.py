@@ -354,7 +354,7 @@ class FixedLagSmoother(_Smoother):
             return
         scan.changes = np.full((len(scan.slots), 2), np.nan)
         for earlier in reversed(self._pending):
-            if scan.t - earlier.t > self._settle:
+            if round(scan.t - earlier.t, 9) > self._settle:  # times are whole nanoseconds
                 break
             self._look_back(earlier, road)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from can_imm.estimation.hypotheses import (
     APART,
+    MOST_FIRST,
     add_local_,
     begin_courses_,
     consider_,
@@ -31,6 +32,7 @@ from can_imm.estimation.traffic import (
     EGO,
     FREE,
     N_GUIDES,
+    N_LOCAL,
     N_PARTIES,
     best_global,
     lane_at,
@@ -74,7 +76,8 @@ NOTE_DTYPE = np.dtype(
     align=True,
 )
 """What a scan said of a slot's object: where it was measured in the vehicle's axes [m] and the
-variance of y [m²], and how probable it is that it is off the lanes."""
+variance of y [m²], how probable it is that it is off the lanes, and whether this is the object's
+first scan."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -132,13 +135,15 @@ def note_(
         z, r, valid, angle: (rows, ...) the scan as it was measured.
     """
     for s in range(notes.shape[0]):
-        notes[s].seen = False
-        notes[s].new = age[s] <= 1
+        notes[s].seen = notes[s].new = False
     for k in range(n):
         s = slot[k]
-        if s < 0 or status[k] != 0 or not (valid[k, 0] and valid[k, 2]):
+        if s < 0:
             continue
         note = notes[s]
+        note.new = age[s] <= 1
+        if status[k] != 0 or not (valid[k, 0] and valid[k, 2]):
+            continue
         note.seen = True
         note.x, note.y, note.noise = position(z[k], r[k], angle[k])
         note.off = 0.0
@@ -176,14 +181,15 @@ def twin_of(T: Any, guide_of: IntArray, notes: Any, s: int) -> int:  # pragma: n
 def meet_(
     T: Any, par: FloatArray, guide_of: IntArray, notes: Any, s: int, t: float
 ) -> int:  # pragma: no cover - compiled
-    """Follow the vehicle in slot s from now on, if there is room; its party, else `FREE`.
+    """Follow the vehicle in slot s from now on, if there is room; its party, else `FREE`, and it may
+    be met in a later scan, when most of the courses of those who were met now are given up.
 
     It is in the lane that is nearest, in the next one, or between two.
     """
     g = 0
     while g < N_GUIDES and T.party[g].slot != FREE:
         g += 1
-    if g == N_GUIDES:
+    if g == N_GUIDES or T.n + MOST_FIRST > N_LOCAL:
         return FREE
     party = T.party[g]
     party.slot, party.unseen, party.outliers, party.since = s, 0.0, 0, t
@@ -206,11 +212,6 @@ def meet_(
     lane = math.floor(seen + 0.5)
     for to in (lane, lane - 1, lane + 1):
         q = add_local_(T, g, to, 0, False, 0.0, 0.0, -1)
-        if q < 0:
-            # no room for hypotheses: it is not followed
-            remove_guide_(T, g)
-            guide_of[s] = FREE
-            return FREE
         for k in range(T.n_global):
             T.odds[k, q] = 0.0
             if to == lane:
@@ -360,7 +361,6 @@ def learn_habits_(
     road: FloatArray,
     P: FloatArray,
     t: float,
-    dt: float,
     speed: float,
     n: int,
     slot: Any,
@@ -388,7 +388,7 @@ def learn_habits_(
         if s < 0 or not notes[s].seen or guide_of[s] == FREE:
             continue
         party = T.party[guide_of[s]]
-        if party.slot != s or party.unseen > 0.0:
+        if party.slot != s or party.unseen > 0.0 or party.outliers > 0:
             continue
         ours = T.local[T.choice[best, guide_of[s]]]
         if changing[guide_of[s]] > CALM or not keeping(ours, t):
@@ -405,7 +405,7 @@ def learn_habits_(
         if rv < np.inf:
             rv += of_direction * (v + vx) ** 2
         learn_wander_(
-            party, lane, dt, note.y - y - lane * road[WIDTH], note.noise, vy - its_vy, rv,
+            party, lane, t, note.y - y - lane * road[WIDTH], note.noise, vy - its_vy, rv,
             of_place, par[P_BESIDE_RATE], par,
         )  # fmt: skip
 

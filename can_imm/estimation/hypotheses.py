@@ -36,6 +36,8 @@ LOG_P: FloatArray = np.tile(_LOG_P - np.log(np.sum(np.exp(_LOG_P))), 2)
 such at a constant rate."""
 N_BEGUN = 6
 """Lane changes that had begun before a vehicle was first seen are tried from so many beginnings."""
+MOST_FIRST = 3 * (1 + 4 * N_DURATIONS * N_BEGUN)
+"""Most courses of a vehicle that is first seen: it may be in one of three lanes."""
 APART = 0.07
 """Courses begin so long one after the other [s], and longer where many vehicles are followed."""
 IMPOSSIBLE = 13.5
@@ -64,11 +66,9 @@ def keeping(one: Any, t: float) -> bool:  # pragma: no cover - compiled
 def add_local_(
     T: Any, who: int, lane: int, turn: int, steady: bool, start: float, duration: float, like: int
 ) -> int:  # pragma: no cover - compiled
-    """Another local hypothesis, with the mean of the one named ``like`` or with none; its number,
-    -1 if there is no room.  Its odds are the caller's to write."""
+    """Another local hypothesis, with the mean of the one named ``like`` or with none; its number.
+    Room for it and its odds are the caller's to see to."""
     q = int(T.n)
-    if q == N_LOCAL:
-        return -1
     one = T.local[q]
     one.who, one.lane, one.turn, one.steady = who, lane, turn, steady
     one.start, one.duration = start, duration
@@ -82,7 +82,8 @@ def add_local_(
 def begin_courses_(
     T: Any, who: int, t: float, par: FloatArray, seen: float
 ) -> None:  # pragma: no cover - compiled
-    """Add the courses of a party that may begin now.
+    """Add the courses of a party that may begin now; those from a lane all or, where there is no
+    room, none.
 
     Args:
         seen: where it is, in lanes, if it is seen for the first time: then those under way that
@@ -101,6 +102,8 @@ def begin_courses_(
             likely |= T.odds[g, like] > -RARE
         if not likely:
             continue
+        if T.n + (MOST_FIRST // 3 if first else 4 * N_DURATIONS) > N_LOCAL:
+            return
         lane = one.lane + one.turn
         for turn in (-1, 1):
             if first and abs(seen - (lane + 0.5 * turn)) > 1.0:
@@ -114,8 +117,6 @@ def begin_courses_(
                     if log_w < -IMPOSSIBLE:
                         continue
                     q = add_local_(T, who, lane, turn, steady, t - (b + 0.5) * span, LASTS[i], like)
-                    if q < 0:
-                        return
                     for g in range(T.n_global):
                         T.odds[g, q] = T.odds[g, like] + log_w
 
@@ -284,6 +285,7 @@ def drop_locals_(T: Any, gone: int) -> None:  # pragma: no cover - compiled
                 for i in range(T.mean.shape[1]):
                     T.rest[g, i] += T.mean[q, i]
                 T.choice[g, gone] = FREE
+    least = T.log_w[best_global(T)] - IMPOSSIBLE
     kept = 0
     for q in range(T.n):
         who = T.local[q].who
@@ -291,7 +293,7 @@ def drop_locals_(T: Any, gone: int) -> None:  # pragma: no cover - compiled
             continue
         keep = False
         for g in range(T.n_global):
-            keep |= T.log_w[g] + T.odds[g, q] >= -IMPOSSIBLE or T.choice[g, who] == q
+            keep |= T.log_w[g] + T.odds[g, q] >= least or T.choice[g, who] == q
         if not keep:
             continue
         to[q] = kept
@@ -309,6 +311,25 @@ def drop_locals_(T: Any, gone: int) -> None:  # pragma: no cover - compiled
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def centre_(T: Any) -> None:  # pragma: no cover - compiled
+    """Let ``x`` be the mean of the likeliest global hypothesis, and the others count from it; in
+    place.
+
+    No hypothesis changes.  What is not linear, the width times a course, is so linearised where
+    that hypothesis is.
+    """
+    best = best_global(T)
+    for i in range(T.top):
+        v = T.rest[best, i]
+        for p in range(N_PARTIES):
+            if T.choice[best, p] != FREE:
+                v += T.mean[T.choice[best, p], i]
+        T.x[i] += v
+        for g in range(T.n_global):
+            T.rest[g, i] -= v
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def consider_(T: Any, t: float, par: FloatArray) -> None:  # pragma: no cover - compiled
     """After all measurements of a scan at time t [s]: settle, split, give up; in place."""
     for who in range(N_PARTIES):
@@ -316,6 +337,7 @@ def consider_(T: Any, t: float, par: FloatArray) -> None:  # pragma: no cover - 
     split_(T)
     drop_globals_(T)
     drop_locals_(T, -1)
+    centre_(T)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

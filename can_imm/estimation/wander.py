@@ -23,19 +23,18 @@ MEMORY_S = 35.0
 """So long it counts how a vehicle has wandered [s]."""
 SURPRISE = 9.0
 """Squared normalised error of a measurement counts as this at most."""
-LONGEST_S = 1.0
-"""What was thought of a vehicle that was not seen for longer is of no use any more."""
 
 WANDER_FIELDS = [
     ("kept", np.int32),
+    ("learnt", np.float64),
     ("evidence", np.float64, (N_LEVELS,)),
     ("level_cov", np.float64, (N_LEVELS, 3)),
     ("level_place", np.float64, (N_LEVELS,)),
     ("level_rate", np.float64, (N_LEVELS,)),
     ("beside", np.float64),
 ]
-"""Of one vehicle: the lane that it has kept, `NO_LANE` while that is not sure; log evidence for
-each level, and covariance (P00, P01, P11), place and rate if it were the true one; ``beside`` the
+"""Of one vehicle: the lane that it has kept, `NO_LANE` while that is not sure; when it was learnt
+from last [s]; log evidence for each level, and covariance (P00, P01, P11), place and rate if it were the true one; ``beside`` the
 standard deviation that follows [m]."""
 NO_LANE = -128
 
@@ -48,6 +47,7 @@ def forget_wander_(one: Any, par: FloatArray) -> None:  # pragma: no cover - com
         one: record with `WANDER_FIELDS`.  par: `road.PARAMETERS`.
     """
     one.kept = NO_LANE
+    one.learnt = -np.inf
     one.evidence[:] = 0.0
     weigh_levels_(one, par)
 
@@ -73,7 +73,7 @@ def weigh_levels_(one: Any, par: FloatArray) -> None:  # pragma: no cover - comp
 def learn_wander_(
     one: Any,
     lane: int,
-    dt: float,
+    t: float,
     off: float,
     r: float,
     off_speed: float,
@@ -85,7 +85,7 @@ def learn_wander_(
     """Take in a measurement of a vehicle that keeps its lane.
 
     Args:
-        lane: the lane.  dt: since the measurement before it [s].
+        lane: the lane.  t: time of the measurement [s].
         off, off_speed: place and speed beside its middle [m, m/s].  r, rv: their variances,
             infinite where not measured.
         road_error: variance of where the middle is thought to be [m²].
@@ -93,7 +93,9 @@ def learn_wander_(
     """
     begins = lane != one.kept
     one.kept = lane
-    memory = math.exp(-dt / MEMORY_S) if dt <= LONGEST_S else 0.0
+    dt = t - one.learnt
+    one.learnt = t
+    memory = math.exp(-dt / MEMORY_S)
     most = -np.inf
     for i in range(N_LEVELS):
         beside = math.sqrt(LEVELS[i] ** 2 + road_error)

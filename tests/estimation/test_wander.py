@@ -52,13 +52,13 @@ def expected_std(par: FloatArray, evidence: FloatArray) -> float:
 
 
 def learn(
-    one: Any, par: FloatArray, t: FloatArray, rows: FloatArray, lane: int, *, dt: float,
+    one: Any, par: FloatArray, t: FloatArray, rows: FloatArray, lane: int, *,
     with_place: bool = True, with_speed: bool = True,
 ) -> None:  # fmt: skip
-    """Take in the rows (K, 2) at times t; the first one ``dt`` after what was before."""
+    """Take in the rows (K, 2) at times t."""
     for k in range(len(t)):
         wander.learn_wander_(
-            one, lane, dt if k == 0 else t[k] - t[k - 1],
+            one, lane, t[k],
             rows[k, 0], STD**2 if with_place else np.inf,
             rows[k, 1], SPEED_STD**2 if with_speed else np.inf, ROAD_ERROR, HURRY, par,
         )  # fmt: skip
@@ -98,7 +98,7 @@ def test_the_levels_are_weighed_by_what_they_foretell(used: str) -> None:
     rows[30] += 2.0
     one = somebody(par)
     what = {"with_place": used != "speed", "with_speed": used != "place"}
-    learn(one, par, t, rows, -2, dt=0.3, **what)
+    learn(one, par, t, rows, -2, **what)
     of = {"both": np.arange(120), "place": np.arange(0, 120, 2), "speed": np.arange(1, 120, 2)}
     evidence = log_evidence(t, rows, of[used], t[-1])
     evidence -= evidence.max()
@@ -115,8 +115,8 @@ def test_an_outlier_is_cut() -> None:
     for off in (0.0, 3.0, 300.0):
         one = somebody(par)
         t = np.arange(0.0, 6.0, 0.1)
-        learn(one, par, t, np.zeros((60, 2)), 0, dt=0.1)
-        wander.learn_wander_(one, 0, 0.1, off, STD**2, 0.0, np.inf, ROAD_ERROR, HURRY, par)
+        learn(one, par, t, np.zeros((60, 2)), 0)
+        wander.learn_wander_(one, 0, 6.0, off, STD**2, 0.0, np.inf, ROAD_ERROR, HURRY, par)
         stds.append(float(one["beside"]))
     assert stds[0] < 0.15
     assert stds[1:] == pytest.approx([stds[0]] * 2, rel=0.05)
@@ -130,44 +130,44 @@ def test_in_another_lane_it_is_still_the_same_driver() -> None:
     t = np.arange(0.0, 4.0, 0.1)
     rows = wanderer(rng, t, 0.2) + rng.standard_normal((40, 2)) * [STD, SPEED_STD]
     one = somebody(par)
-    learn(one, par, t[:25], rows[:25], 1, dt=0.1)
-    learn(one, par, t[25:], rows[25:], 2, dt=0.1)
+    learn(one, par, t[:25], rows[:25], 1)
+    learn(one, par, t[25:], rows[25:], 2)
     first = log_evidence(t[:25], rows[:25], np.arange(50), t[-1])
     second = log_evidence(t[25:], rows[25:], np.arange(30), t[-1])
     evidence = first + second
     np.testing.assert_allclose(one["evidence"], evidence - evidence.max(), atol=1e-9)
     # after a time in which it kept none, too
     again = somebody(par)
-    learn(again, par, t[:25], rows[:25], 1, dt=0.1)
+    learn(again, par, t[:25], rows[:25], 1)
     again["kept"] = wander.NO_LANE
-    learn(again, par, t[25:], rows[25:], 1, dt=0.1)
+    learn(again, par, t[25:], rows[25:], 1)
     np.testing.assert_allclose(again["evidence"], one["evidence"], atol=1e-9)
 
 
 @pytest.mark.parametrize("lane", [1, 2])
-def test_after_a_long_time_what_was_learnt_is_of_no_use(lane: int) -> None:
+@pytest.mark.parametrize("gap", [0.1, 0.9, 7.0])
+def test_what_was_learnt_fades_with_time(gap: float, lane: int) -> None:
+    """Whether the vehicle was seen in it or not."""
     rng = np.random.default_rng(7)
     par = parameters()
     t = np.arange(0.0, 20.0, 0.1)
     row = np.array([0.3, 0.1])
-    for gap, forgets in ((wander.LONGEST_S, False), (wander.LONGEST_S + 0.01, True)):
-        one = somebody(par)
-        learn(one, par, t, 0.2 * wanderer(rng, t, 0.1), 1, dt=0.1)
-        before = one["evidence"].copy()
-        place, rate, cov = (one[f].copy() for f in ("level_place", "level_rate", "level_cov"))
-        learn(one, par, t[:1], row[None], lane, dt=gap)
-        evidence = np.zeros(wander.N_LEVELS) if forgets else math.exp(-1.0 / 35.0) * before
-        f = np.array(fading(HURRY, gap)).reshape(2, 2)
-        for i, level in enumerate(wander.LEVELS):
-            S = np.diag([1.0, HURRY**2]) * (level**2 + ROAD_ERROR)
-            P, x = S, np.zeros(2)
-            if lane == 1:
-                P = np.array([[cov[i, 0], cov[i, 1]], [cov[i, 1], cov[i, 2]]])
-                P, x = f @ (P - S) @ f.T + S, f @ [place[i], rate[i]]
-            factor = np.linalg.cholesky(P + np.diag([STD**2, SPEED_STD**2]))
-            e = np.linalg.solve(factor, row - x)
-            evidence[i] -= 0.5 * e @ e + np.log(np.diag(factor)).sum()
-        np.testing.assert_allclose(one["evidence"], evidence - evidence.max(), atol=1e-9)
+    one = somebody(par)
+    learn(one, par, t, 0.2 * wanderer(rng, t, 0.1), 1)
+    evidence = math.exp(-gap / wander.MEMORY_S) * one["evidence"]
+    place, rate, cov = (one[f].copy() for f in ("level_place", "level_rate", "level_cov"))
+    learn(one, par, t[-1:] + gap, row[None], lane)
+    f = np.array(fading(HURRY, gap)).reshape(2, 2)
+    for i, level in enumerate(wander.LEVELS):
+        S = np.diag([1.0, HURRY**2]) * (level**2 + ROAD_ERROR)
+        P, x = S, np.zeros(2)
+        if lane == 1:
+            P = np.array([[cov[i, 0], cov[i, 1]], [cov[i, 1], cov[i, 2]]])
+            P, x = f @ (P - S) @ f.T + S, f @ [place[i], rate[i]]
+        factor = np.linalg.cholesky(P + np.diag([STD**2, SPEED_STD**2]))
+        e = np.linalg.solve(factor, row - x)
+        evidence[i] -= 0.5 * e @ e + np.log(np.diag(factor)).sum()
+    np.testing.assert_allclose(one["evidence"], evidence - evidence.max(), atol=1e-9)
 
 
 # ---- in traffic
