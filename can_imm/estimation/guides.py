@@ -11,11 +11,14 @@ import numpy as np
 from can_imm.estimation.hypotheses import (
     APART,
     MOST_FIRST,
+    MOST_LANES,
     add_local_,
     begin_courses_,
+    beyond,
     consider_,
     keeping,
     remove_guide_,
+    split_,
 )
 from can_imm.estimation.road import (
     MOUNTING,
@@ -61,6 +64,9 @@ FEW = 8
 """Up to so many vehicles are followed as closely as can be."""
 CALM = 0.16
 """A vehicle that is less likely to change lanes shows how it wanders."""
+LANES_ASIDE = MOST_LANES // 2
+"""A vehicle that is first seen may be in a lane so far aside of the likeliest one."""
+NOWHERE: FloatArray = np.zeros(0)
 TWIN_AHEAD, TWIN_BESIDE = 3.0, 1.0
 """No two vehicles are so near along and across the road [m]."""
 
@@ -200,23 +206,24 @@ def meet_(
     T.P[a, a] = party.beside**2
     T.P[a + 1, a + 1] = (par[P_BESIDE_RATE] * party.beside) ** 2
     lane_row_(T.h, T.x[WAY], notes[s].x)
-    best = best_global(T)
-    y = notes[s].y
-    for i in range(N_ROAD):
-        v = T.x[i] + T.rest[best, i]
-        for p in range(T.choice.shape[1]):
-            if T.choice[best, p] != FREE:
-                v += T.mean[T.choice[best, p], i]
-        y -= T.h[i] * v
-    seen = y / T.x[WIDTH]
-    lane = math.floor(seen + 0.5)
-    for to in (lane, lane - 1, lane + 1):
+    # where the road leads, and so in which lane it is, each global hypothesis says for itself
+    places = np.empty(T.n_global)
+    for k in range(T.n_global):
+        y = notes[s].y
+        for i in range(N_ROAD):
+            y -= T.h[i] * (T.x[i] + beyond(T, k, i))
+        places[k] = y / (T.x[WIDTH] + beyond(T, k, WIDTH))
+    middle = math.floor(places[best_global(T)] + 0.5)
+    first = T.n
+    for to in range(middle - LANES_ASIDE, middle + LANES_ASIDE + 1):
+        if np.abs(places - to).min() > 1.5:
+            continue
         q = add_local_(T, g, to, 0, False, 0.0, 0.0, -1)
         for k in range(T.n_global):
             T.odds[k, q] = 0.0
-            if to == lane:
+            if q == first or abs(places[k] - to) < abs(places[k] - T.local[T.choice[k, g]].lane):
                 T.choice[k, g] = q
-    begin_courses_(T, g, t, par, seen)
+    begin_courses_(T, g, t, par, places)
     return g
 
 
@@ -284,6 +291,31 @@ def see_speed_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def see_(
+    T: Any, guide_of: IntArray, note: Any, g: int, speed: float, t: float,
+    z: FloatArray, r: FloatArray, valid: Any, angle: float,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """Take in what a scan says of vehicle g; one that can't be it too often is followed no longer;
+    in place.
+
+    Args:
+        note: of `NOTE_DTYPE`.  speed: of the ego [m/s].
+        z, r, valid: (4,) and angle, the row as it was measured.
+    """
+    party = T.party[g]
+    party.unseen = 0.0
+    if not see_place_(T, g, note.x, note.y, note.noise, t):
+        party.outliers += 1
+        if party.outliers == MAX_OUTLIERS:
+            leave_(T, guide_of, g)
+        return
+    party.outliers = 0
+    if valid[1] and valid[3]:
+        vx, vy, noise = velocity(z, r, angle)
+        see_speed_(T, g, note.x, vx, vy, noise, speed, t)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def watch_(
     T: Any,
     par: FloatArray,
@@ -319,36 +351,33 @@ def watch_(
         if gone or notes[s].new or T.party[g].unseen > UNSEEN_S:
             leave_(T, guide_of, g)
     apart = APART * max(1.0, (T.top - N_ROAD) / (2.0 * FEW))
+    new, n_new = np.empty(n, np.int64), 0
     for k in range(n):
         s = slot[k]
         if s < 0 or not notes[s].seen or notes[s].off > OFF:
             continue
-        note = notes[s]
-        if not SEEN_FROM < note.x < SEEN_TO:
+        if not SEEN_FROM < notes[s].x < SEEN_TO:
             continue
         g = guide_of[s]
         if g == FREE or T.party[g].slot != s:
-            guide_of[s] = g = twin_of(T, guide_of, notes, s)
-            if g != FREE:
-                continue
-            g = meet_(T, par, guide_of, notes, s, t)
-            if g == FREE:
-                continue
-        elif t - T.party[g].begun >= apart:
-            begin_courses_(T, g, t, par, np.nan)
-        party = T.party[g]
-        party.unseen = 0.0
-        if not see_place_(T, g, note.x, note.y, note.noise, t):
-            party.outliers += 1
-            if party.outliers == MAX_OUTLIERS:
-                leave_(T, guide_of, g)
+            new[n_new] = k
+            n_new += 1
             continue
-        party.outliers = 0
-        if valid[k, 1] and valid[k, 3]:
-            vx, vy, noise = velocity(z[k], r[k], angle[k])
-            see_speed_(T, g, note.x, vx, vy, noise, v, t)
+        if t - T.party[g].begun >= apart:
+            begin_courses_(T, g, t, par, NOWHERE)
+        see_(T, guide_of, notes[s], g, v, t, z[k], r[k], valid[k], angle[k])
+    # the nearest first: they show where the others' lanes are
+    for k in new[np.argsort(np.array([abs(notes[slot[k]].x) for k in new[:n_new]]))]:
+        s = slot[k]
+        guide_of[s] = g = twin_of(T, guide_of, notes, s)
+        if g != FREE:
+            continue
+        g = meet_(T, par, guide_of, notes, s, t)
+        if g != FREE:
+            see_(T, guide_of, notes[s], g, v, t, z[k], r[k], valid[k], angle[k])
+            split_(T)
     if t - T.party[EGO].begun >= apart:
-        begin_courses_(T, EGO, t, par, np.nan)
+        begin_courses_(T, EGO, t, par, NOWHERE)
     consider_(T, t, par)
 
 

@@ -36,8 +36,13 @@ LOG_P: FloatArray = np.tile(_LOG_P - np.log(np.sum(np.exp(_LOG_P))), 2)
 such at a constant rate."""
 N_BEGUN = 6
 """Lane changes that had begun before a vehicle was first seen are tried from so many beginnings."""
-MOST_FIRST = 3 * (1 + 4 * N_DURATIONS * N_BEGUN)
-"""Most courses of a vehicle that is first seen: it may be in one of three lanes."""
+FIRST_EVERY = 2
+"""Every so many durations are tried there."""
+MOST_LANES = 5
+"""In so many lanes a vehicle may be that is first seen."""
+_BEGUN = 2 * ((N_DURATIONS + FIRST_EVERY - 1) // FIRST_EVERY) * N_BEGUN
+MOST_FIRST = MOST_LANES + 2 * MOST_LANES * _BEGUN
+"""Most courses of a vehicle that is first seen."""
 APART = 0.07
 """Courses begin so long one after the other [s], and longer where many vehicles are followed."""
 IMPOSSIBLE = 13.5
@@ -80,18 +85,19 @@ def add_local_(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def begin_courses_(
-    T: Any, who: int, t: float, par: FloatArray, seen: float
+    T: Any, who: int, t: float, par: FloatArray, places: FloatArray
 ) -> None:  # pragma: no cover - compiled
     """Add the courses of a party that may begin now; those from a lane all or, where there is no
     room, none.
 
     Args:
-        seen: where it is, in lanes, if it is seen for the first time: then those under way that
-            pass there are added; else NaN.
+        places: (n_global,) where it is, in lanes, by each global hypothesis if it is seen for the
+            first time: then those under way that pass there are added; else (0,).
     """
-    first = seen == seen
+    first = len(places) > 0
     since = t - T.party[who].begun
     T.party[who].begun = t
+    every = FIRST_EVERY if first else 1
     n = T.n
     for like in range(n):
         one = T.local[like]
@@ -102,18 +108,20 @@ def begin_courses_(
             likely |= T.odds[g, like] > -RARE
         if not likely:
             continue
-        if T.n + (MOST_FIRST // 3 if first else 4 * N_DURATIONS) > N_LOCAL:
+        if T.n + (2 * _BEGUN if first else 4 * N_DURATIONS) > N_LOCAL:
             return
         lane = one.lane + one.turn
         for turn in (-1, 1):
-            if first and abs(seen - (lane + 0.5 * turn)) > 1.0:
+            if first and np.abs(places - (lane + 0.5 * turn)).min() > 1.0:
                 continue
             for i in range(2 * N_DURATIONS):
+                if i % N_DURATIONS % every != 0:
+                    continue
                 steady = i >= N_DURATIONS
                 share = par[P_CHANGE_STEADY] if steady else 1.0 - par[P_CHANGE_STEADY]
                 for b in range(N_BEGUN if first else 1):
                     span = LASTS[i] / N_BEGUN if first else since
-                    log_w = math.log(0.5 * par[P_CHANGE_RATE] * span * share) + LOG_P[i]
+                    log_w = math.log(0.5 * par[P_CHANGE_RATE] * span * share * every) + LOG_P[i]
                     if log_w < -IMPOSSIBLE:
                         continue
                     q = add_local_(T, who, lane, turn, steady, t - (b + 0.5) * span, LASTS[i], like)
@@ -311,6 +319,16 @@ def drop_locals_(T: Any, gone: int) -> None:  # pragma: no cover - compiled
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def beyond(T: Any, g: int, i: int) -> float:  # pragma: no cover - compiled
+    """By how much state i of global hypothesis g is more than ``x``."""
+    v = T.rest[g, i]
+    for p in range(N_PARTIES):
+        if T.choice[g, p] != FREE:
+            v += T.mean[T.choice[g, p], i]
+    return float(v)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def centre_(T: Any) -> None:  # pragma: no cover - compiled
     """Let ``x`` be the mean of the likeliest global hypothesis, and the others count from it; in
     place.
@@ -320,10 +338,7 @@ def centre_(T: Any) -> None:  # pragma: no cover - compiled
     """
     best = best_global(T)
     for i in range(T.top):
-        v = T.rest[best, i]
-        for p in range(N_PARTIES):
-            if T.choice[best, p] != FREE:
-                v += T.mean[T.choice[best, p], i]
+        v = beyond(T, best, i)
         T.x[i] += v
         for g in range(T.n_global):
             T.rest[g, i] -= v
