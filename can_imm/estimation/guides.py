@@ -67,8 +67,11 @@ CALM = 0.16
 LANES_ASIDE = MOST_LANES // 2
 """A vehicle that is first seen may be in a lane so far aside of the likeliest one."""
 NOWHERE: FloatArray = np.zeros(0)
-TWIN_AHEAD, TWIN_BESIDE = 3.0, 1.0
-"""No two vehicles are so near along and across the road [m]."""
+TWIN_AHEAD = 3.0
+"""No two vehicles in a lane are so near [m]."""
+NO_TWIN, STILL_TWIN = 4.0, 2.0
+"""A vehicle in the next lane does not seem to be nearer by so many standard deviations; a second
+track does not leave its first one by so many."""
 
 NOTE_DTYPE = np.dtype(
     [
@@ -168,19 +171,46 @@ def leave_(T: Any, guide_of: IntArray, g: int) -> None:  # pragma: no cover - co
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def twin_of(T: Any, guide_of: IntArray, notes: Any, s: int) -> int:  # pragma: no cover - compiled
-    """The party that slot s is a second track of, `FREE` for none."""
+def together(
+    one: Any, other: Any, ahead: float, beside: float
+) -> bool:  # pragma: no cover - compiled
+    """Whether two notes are of places no further apart along and across the road [m]."""
+    return bool(abs(one.x - other.x) < ahead and abs(one.y - other.y) < beside)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def twin_of(T: Any, notes: Any, s: int, me: int) -> int:  # pragma: no cover - compiled
+    """The party that slot s is a second track of, `FREE` for none.
+
+    Two vehicles beside each other are a lane apart; the measurements must rule that out.
+
+    Args:
+        me: party of the slot, `FREE` for none; it is a second track only of one that has been
+            followed for longer.
+    """
     for g in range(N_GUIDES):
         other = T.party[g].slot
-        if (
-            other != FREE
-            and other != s
-            and notes[other].seen
-            and abs(notes[other].x - notes[s].x) < TWIN_AHEAD
-            and abs(notes[other].y - notes[s].y) < TWIN_BESIDE
-        ):
+        if other == FREE or other == s or not notes[other].seen:
+            continue
+        if me != FREE:
+            longer = T.party[me].since - T.party[g].since
+            if longer < 0.0 or (longer == 0.0 and g > me):
+                continue
+        error = math.sqrt(notes[other].noise + notes[s].noise)
+        beside = min(T.x[WIDTH] - NO_TWIN * error, 0.5 * T.x[WIDTH])
+        if together(notes[other], notes[s], TWIN_AHEAD, beside):
             return g
     return FREE
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def still_twin(T: Any, notes: Any, s: int, g: int) -> bool:  # pragma: no cover - compiled
+    """Whether slot s may still be a second track of party g."""
+    other = T.party[g].slot
+    error = math.sqrt(notes[other].noise + notes[s].noise)
+    return not notes[other].seen or together(
+        notes[other], notes[s], 2.0 * TWIN_AHEAD, 0.5 * T.x[WIDTH] + STILL_TWIN * error
+    )
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -350,6 +380,11 @@ def watch_(
         gone = notes[s].seen and (notes[s].off > OFF or not SEEN_FROM < notes[s].x < SEEN_TO)
         if gone or notes[s].new or T.party[g].unseen > UNSEEN_S:
             leave_(T, guide_of, g)
+        elif notes[s].seen:
+            twin = twin_of(T, notes, s, g)
+            if twin != FREE:
+                leave_(T, guide_of, g)
+                guide_of[s] = twin
     apart = APART * max(1.0, (T.top - N_ROAD) / (2.0 * FEW))
     new, n_new = np.empty(n, np.int64), 0
     for k in range(n):
@@ -359,7 +394,11 @@ def watch_(
         if not SEEN_FROM < notes[s].x < SEEN_TO:
             continue
         g = guide_of[s]
-        if g == FREE or T.party[g].slot != s:
+        if g != FREE and T.party[g].slot != s:
+            if not notes[s].new and still_twin(T, notes, s, g):
+                continue
+            g = guide_of[s] = FREE
+        if g == FREE:
             new[n_new] = k
             n_new += 1
             continue
@@ -369,7 +408,7 @@ def watch_(
     # the nearest first: they show where the others' lanes are
     for k in new[np.argsort(np.array([abs(notes[slot[k]].x) for k in new[:n_new]]))]:
         s = slot[k]
-        guide_of[s] = g = twin_of(T, guide_of, notes, s)
+        guide_of[s] = g = twin_of(T, notes, s, FREE)
         if g != FREE:
             continue
         g = meet_(T, par, guide_of, notes, s, t)
