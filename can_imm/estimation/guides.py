@@ -67,11 +67,13 @@ CALM = 0.16
 LANES_ASIDE = MOST_LANES // 2
 """A vehicle that is first seen may be in a lane so far aside of the likeliest one."""
 NOWHERE: FloatArray = np.zeros(0)
-TWIN_AHEAD = 3.0
-"""No two vehicles in a lane are so near [m]."""
-NO_TWIN, STILL_TWIN = 4.0, 2.0
-"""A vehicle in the next lane does not seem to be nearer by so many standard deviations; a second
-track does not leave its first one by so many."""
+TWIN_AHEAD, TWIN_BESIDE = 3.0, 0.3
+"""A second track of a vehicle is no further from the first one along and across the road [m]."""
+TWIN_ERRORS, STILL_ERRORS, NO_TWIN_ERRORS = 2.0, 2.5, 4.0
+"""It does not seem to be further aside by so many standard deviations more, or by so many later on,
+and a vehicle in the next lane does not seem to be nearer by so many."""
+TWIN_S = 1.0
+"""What has been followed for longer [s] is a vehicle of its own."""
 
 NOTE_DTYPE = np.dtype(
     [
@@ -179,25 +181,17 @@ def together(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def twin_of(T: Any, notes: Any, s: int, me: int) -> int:  # pragma: no cover - compiled
-    """The party that slot s is a second track of, `FREE` for none.
+def twin_of(T: Any, notes: Any, s: int, since: float) -> int:  # pragma: no cover - compiled
+    """The party that slot s, seen since a time [s], is a second track of; `FREE` for none.
 
-    Two vehicles beside each other are a lane apart; the measurements must rule that out.
-
-    Args:
-        me: party of the slot, `FREE` for none; it is a second track only of one that has been
-            followed for longer.
+    A second track appears on a vehicle that is followed already.
     """
     for g in range(N_GUIDES):
         other = T.party[g].slot
-        if other == FREE or other == s or not notes[other].seen:
+        if other == FREE or not (notes[other].seen and T.party[g].since < since):
             continue
-        if me != FREE:
-            longer = T.party[me].since - T.party[g].since
-            if longer < 0.0 or (longer == 0.0 and g > me):
-                continue
         error = math.sqrt(notes[other].noise + notes[s].noise)
-        beside = min(T.x[WIDTH] - NO_TWIN * error, 0.5 * T.x[WIDTH])
+        beside = min(TWIN_BESIDE + TWIN_ERRORS * error, T.x[WIDTH] - NO_TWIN_ERRORS * error)
         if together(notes[other], notes[s], TWIN_AHEAD, beside):
             return g
     return FREE
@@ -208,19 +202,18 @@ def still_twin(T: Any, notes: Any, s: int, g: int) -> bool:  # pragma: no cover 
     """Whether slot s may still be a second track of party g."""
     other = T.party[g].slot
     error = math.sqrt(notes[other].noise + notes[s].noise)
-    return not notes[other].seen or together(
-        notes[other], notes[s], 2.0 * TWIN_AHEAD, 0.5 * T.x[WIDTH] + STILL_TWIN * error
-    )
+    beside = TWIN_BESIDE + STILL_ERRORS * error
+    return not notes[other].seen or together(notes[other], notes[s], 1.5 * TWIN_AHEAD, beside)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def meet_(
     T: Any, par: FloatArray, guide_of: IntArray, notes: Any, s: int, t: float
 ) -> int:  # pragma: no cover - compiled
-    """Follow the vehicle in slot s from now on, if there is room; its party, else `FREE`, and it may
-    be met in a later scan, when most of the courses of those who were met now are given up.
+    """Follow the vehicle in slot s from now on; its party, `FREE` if there is no room.
 
-    It is in the lane that is nearest, in the next one, or between two.
+    It is in the lane that is nearest, in the next one, or between two.  Of a crowd some are only
+    met in the next scans, when most of the others' courses are given up.
     """
     g = 0
     while g < N_GUIDES and T.party[g].slot != FREE:
@@ -380,8 +373,8 @@ def watch_(
         gone = notes[s].seen and (notes[s].off > OFF or not SEEN_FROM < notes[s].x < SEEN_TO)
         if gone or notes[s].new or T.party[g].unseen > UNSEEN_S:
             leave_(T, guide_of, g)
-        elif notes[s].seen:
-            twin = twin_of(T, notes, s, g)
+        elif notes[s].seen and t - T.party[g].since <= TWIN_S:
+            twin = twin_of(T, notes, s, T.party[g].since)
             if twin != FREE:
                 leave_(T, guide_of, g)
                 guide_of[s] = twin
@@ -408,7 +401,7 @@ def watch_(
     # the nearest first: they show where the others' lanes are
     for k in new[np.argsort(np.array([abs(notes[slot[k]].x) for k in new[:n_new]]))]:
         s = slot[k]
-        guide_of[s] = g = twin_of(T, notes, s, FREE)
+        guide_of[s] = g = twin_of(T, notes, s, t)
         if g != FREE:
             continue
         g = meet_(T, par, guide_of, notes, s, t)

@@ -36,12 +36,9 @@ LOG_P: FloatArray = np.tile(_LOG_P - np.log(np.sum(np.exp(_LOG_P))), 2)
 such at a constant rate."""
 N_BEGUN = 6
 """Lane changes that had begun before a vehicle was first seen are tried from so many beginnings."""
-FIRST_EVERY = 2
-"""Every so many durations are tried there."""
 MOST_LANES = 5
 """In so many lanes a vehicle may be that is first seen."""
-_BEGUN = 2 * ((N_DURATIONS + FIRST_EVERY - 1) // FIRST_EVERY) * N_BEGUN
-MOST_FIRST = MOST_LANES + 2 * MOST_LANES * _BEGUN
+MOST_FIRST = MOST_LANES * (1 + 2 * len(LASTS) * N_BEGUN)
 """Most courses of a vehicle that is first seen."""
 APART = 0.07
 """Courses begin so long one after the other [s], and longer where many vehicles are followed."""
@@ -55,6 +52,8 @@ BETTER = 0.3
 """And one of the same kind takes the place of the one chosen if it is likelier by this."""
 LATE = 20.0
 """A global hypothesis that is less likely than the best by this is given up."""
+SAME = 1e-6
+"""What is likelier by no more is as likely: rounding decides nothing."""
 SPLITS = 3
 """Most global hypotheses that are made in one scan."""
 
@@ -97,7 +96,6 @@ def begin_courses_(
     first = len(places) > 0
     since = t - T.party[who].begun
     T.party[who].begun = t
-    every = FIRST_EVERY if first else 1
     n = T.n
     for like in range(n):
         one = T.local[like]
@@ -108,20 +106,18 @@ def begin_courses_(
             likely |= T.odds[g, like] > -RARE
         if not likely:
             continue
-        if T.n + (2 * _BEGUN if first else 4 * N_DURATIONS) > N_LOCAL:
+        if T.n + 2 * len(LASTS) * (N_BEGUN if first else 1) > N_LOCAL:
             return
         lane = one.lane + one.turn
         for turn in (-1, 1):
             if first and np.abs(places - (lane + 0.5 * turn)).min() > 1.0:
                 continue
-            for i in range(2 * N_DURATIONS):
-                if i % N_DURATIONS % every != 0:
-                    continue
+            for i in range(len(LASTS)):
                 steady = i >= N_DURATIONS
                 share = par[P_CHANGE_STEADY] if steady else 1.0 - par[P_CHANGE_STEADY]
                 for b in range(N_BEGUN if first else 1):
                     span = LASTS[i] / N_BEGUN if first else since
-                    log_w = math.log(0.5 * par[P_CHANGE_RATE] * span * share * every) + LOG_P[i]
+                    log_w = math.log(0.5 * par[P_CHANGE_RATE] * span * share) + LOG_P[i]
                     if log_w < -IMPOSSIBLE:
                         continue
                     q = add_local_(T, who, lane, turn, steady, t - (b + 0.5) * span, LASTS[i], like)
@@ -222,7 +218,7 @@ def split_(T: Any) -> None:  # pragma: no cover - compiled
             for p in range(T.n):
                 v = T.log_w[one] + T.odds[one, p]
                 who = T.local[p].who
-                if v <= value or alike(T, T.choice[one, who], p):
+                if v <= value + SAME or alike(T, T.choice[one, who], p):
                     continue
                 if find_global(T, one, who, p) < 0:
                     value, g, q = v, one, p
@@ -255,7 +251,7 @@ def drop_globals_(T: Any) -> None:  # pragma: no cover - compiled
         while keep and other < kept:
             if agree(T, g, other, -1):
                 keep = False
-                if T.log_w[g] > T.log_w[other]:
+                if T.log_w[g] > T.log_w[other] + SAME:
                     copy_global_(T, g, other)
             other += 1
         if keep:

@@ -34,8 +34,8 @@ WANDER_FIELDS = [
     ("beside", np.float64),
 ]
 """Of one vehicle: the lane that it has kept, `NO_LANE` while that is not sure; when it was learnt
-from last [s]; log evidence for each level, and covariance (P00, P01, P11), place and rate if it were the true one; ``beside`` the
-standard deviation that follows [m]."""
+from last [s]; log evidence for each level, and covariance (P00, P01, P11), place and rate if it
+were the true one; ``beside`` the standard deviation that follows [m]."""
 NO_LANE = -128
 
 
