@@ -5,8 +5,11 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
 import can_imm
@@ -37,3 +40,22 @@ gc.set_threshold(100_000, 20, 100)
 # examples in every run, so that a red run is red again.
 settings.register_profile("can_imm", deadline=None, derandomize=True)
 settings.load_profile("can_imm")
+
+_ahead: list[subprocess.Popen[bytes]] = []
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Where nothing is compiled yet, let another process do half of it."""
+    if not any(_package.glob("estimation/__pycache__/*.nbc")) and (os.cpu_count() or 1) > 1:
+        script = Path(__file__).with_name("compile_ahead.py")
+        _ahead.append(
+            subprocess.Popen(
+                [sys.executable, script], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            )
+        )
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    for process in _ahead:
+        process.kill()
+        process.wait()

@@ -377,7 +377,7 @@ def test_a_lag_knows_of_lane_changes_what_the_filter_knows_then(lag: float) -> N
     for k in range(15, 66, 4):
         at, reports = said[k]
         known = [scan for scan in scans if scan.t_ns <= when[k]]
-        cut = [scan for scan in known if scan.t_ns * 1e-9 - at * 1e-9 <= SETTLE_S]
+        cut = [scan for scan in known if scan.t_ns - at <= round(SETTLE_S * 1e9)]
         detector, _, _ = on_the_motorway(cut, None)
         assert detector.road is not None
         for report in reports:

@@ -66,7 +66,6 @@ CALM = 0.16
 """A vehicle that is less likely to change lanes shows how it wanders."""
 LANES_ASIDE = MOST_LANES // 2
 """A vehicle that is first seen may be in a lane so far aside of the likeliest one."""
-NOWHERE: FloatArray = np.zeros(0)
 TWIN_AHEAD, TWIN_BESIDE = 3.0, 0.3
 """A second track of a vehicle is no further from the first one along and across the road [m]."""
 TWIN_ERRORS, STILL_ERRORS, NO_TWIN_ERRORS = 2.0, 2.5, 4.0
@@ -379,6 +378,7 @@ def watch_(
                 leave_(T, guide_of, g)
                 guide_of[s] = twin
     apart = APART * max(1.0, (T.top - N_ROAD) / (2.0 * FEW))
+    nowhere = np.empty(0)
     new, n_new = np.empty(n, np.int64), 0
     for k in range(n):
         s = slot[k]
@@ -396,7 +396,7 @@ def watch_(
             n_new += 1
             continue
         if t - T.party[g].begun >= apart:
-            begin_courses_(T, g, t, par, NOWHERE)
+            begin_courses_(T, g, t, par, nowhere)
         see_(T, guide_of, notes[s], g, v, t, z[k], r[k], valid[k], angle[k])
     # the nearest first: they show where the others' lanes are
     for k in new[np.argsort(np.array([abs(notes[slot[k]].x) for k in new[:n_new]]))]:
@@ -409,7 +409,7 @@ def watch_(
             see_(T, guide_of, notes[s], g, v, t, z[k], r[k], valid[k], angle[k])
             split_(T)
     if t - T.party[EGO].begun >= apart:
-        begin_courses_(T, EGO, t, par, NOWHERE)
+        begin_courses_(T, np.int64(EGO), t, par, nowhere)
     consider_(T, t, par)
 
 

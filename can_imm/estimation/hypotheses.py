@@ -347,7 +347,7 @@ def consider_(T: Any, t: float, par: FloatArray) -> None:  # pragma: no cover - 
         settle_(T, who, t, par[P_SETTLE])
     split_(T)
     drop_globals_(T)
-    drop_locals_(T, -1)
+    drop_locals_(T, np.int64(-1))
     centre_(T)
 
 

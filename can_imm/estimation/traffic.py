@@ -454,7 +454,7 @@ def drive_(
                     T.shift[q] = (slope - its_slope) * width / speed
                 else:
                     T.shift[q] = (its_bend - bend) * width / speed
-        measure_(T, m, z, r, EGO, np.inf)
+        measure_(T, m, z, r, np.int64(EGO), np.inf)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -474,7 +474,7 @@ def turn_with_road_(
     """The ego turns as the road does; in place."""
     if speed == speed and yaw_rate == yaw_rate:
         m = turn_row_(T, speed)
-        measure_(T, m, yaw_rate, par[P_TURN_STD] ** 2, NOBODY, np.inf)
+        measure_(T, np.int64(m), yaw_rate, par[P_TURN_STD] ** 2, np.int64(NOBODY), np.inf)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
