@@ -10,12 +10,11 @@ import numpy as np
 
 from can_imm.estimation.hypotheses import (
     APART,
-    MOST_FIRST,
-    MOST_LANES,
     add_local_,
     begin_courses_,
     beyond,
     consider_,
+    count_first,
     keeping,
     remove_guide_,
     split_,
@@ -60,17 +59,19 @@ GATE = 25.0
 """Squared normalised error above which a vehicle is not where it was."""
 MAX_OUTLIERS = 4
 """After so many in a row it is another one."""
-FEW = 8
+FEW = 6
 """Up to so many vehicles are followed as closely as can be."""
 CALM = 0.16
 """A vehicle that is less likely to change lanes shows how it wanders."""
-LANES_ASIDE = MOST_LANES // 2
-"""A vehicle that is first seen may be in a lane so far aside of the likeliest one."""
-TWIN_AHEAD, TWIN_BESIDE = 3.0, 0.3
+MOST_LANES = 5
+"""In so many lanes a vehicle may be that is first seen."""
+TWIN_AHEAD, TWIN_BESIDE = 3.0, 1.0
 """A second track of a vehicle is no further from the first one along and across the road [m]."""
-TWIN_ERRORS, STILL_ERRORS, NO_TWIN_ERRORS = 2.0, 2.5, 4.0
-"""It does not seem to be further aside by so many standard deviations more, or by so many later on,
-and a vehicle in the next lane does not seem to be nearer by so many."""
+TWIN_LATER = 3
+"""Of two tracks that began so many scans apart the later one is surely a second one."""
+TWIN_CLOSE = 3.0
+"""Of two that began together each may as well be a vehicle; to be one, they must be nearer by this
+factor."""
 TWIN_S = 1.0
 """What has been followed for longer [s] is a vehicle of its own."""
 
@@ -80,14 +81,15 @@ NOTE_DTYPE = np.dtype(
         ("y", np.float64),
         ("noise", np.float64),
         ("off", np.float64),
+        ("age", np.int32),
         ("seen", np.bool_),
         ("new", np.bool_),
     ],
     align=True,
 )
 """What a scan said of a slot's object: where it was measured in the vehicle's axes [m] and the
-variance of y [m²], how probable it is that it is off the lanes, and whether this is the object's
-first scan."""
+variance of y [m²], how probable it is that it is off the lanes, in how many scans it was until
+then, whether it was in this one, and as a new one."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -151,7 +153,7 @@ def note_(
         if s < 0:
             continue
         note = notes[s]
-        note.new = age[s] <= 1
+        note.age, note.new = age[s], age[s] <= 1
         if status[k] != 0 or not (valid[k, 0] and valid[k, 2]):
             continue
         note.seen = True
@@ -172,26 +174,33 @@ def leave_(T: Any, guide_of: IntArray, g: int) -> None:  # pragma: no cover - co
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def together(
-    one: Any, other: Any, ahead: float, beside: float
-) -> bool:  # pragma: no cover - compiled
-    """Whether two notes are of places no further apart along and across the road [m]."""
-    return bool(abs(one.x - other.x) < ahead and abs(one.y - other.y) < beside)
+def later(one: Any, other: Any) -> bool:  # pragma: no cover - compiled
+    """Whether the track of a note began when there was the other's already."""
+    return bool(one.age + TWIN_LATER <= other.age)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def twin_of(T: Any, notes: Any, s: int, since: float) -> int:  # pragma: no cover - compiled
-    """The party that slot s, seen since a time [s], is a second track of; `FREE` for none.
+def together(one: Any, other: Any, nearer: float) -> bool:  # pragma: no cover - compiled
+    """Whether two notes are of places as near as those of one vehicle, or nearer by a factor."""
+    return bool(
+        abs(one.x - other.x) < TWIN_AHEAD / nearer and abs(one.y - other.y) < TWIN_BESIDE / nearer
+    )
 
-    A second track appears on a vehicle that is followed already.
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def twin_of(T: Any, notes: Any, s: int) -> int:  # pragma: no cover - compiled
+    """The party that slot s is a second track of, `FREE` for none.
+
+    It may have begun together with one only in its own first scan.
     """
     for g in range(N_GUIDES):
         other = T.party[g].slot
-        if other == FREE or not (notes[other].seen and T.party[g].since < since):
+        if other in (FREE, s) or not notes[other].seen:
             continue
-        error = math.sqrt(notes[other].noise + notes[s].noise)
-        beside = min(TWIN_BESIDE + TWIN_ERRORS * error, T.x[WIDTH] - NO_TWIN_ERRORS * error)
-        if together(notes[other], notes[s], TWIN_AHEAD, beside):
+        follows = later(notes[s], notes[other])
+        if not (follows or notes[s].new):
+            continue
+        if together(notes[s], notes[other], 1.0 if follows else TWIN_CLOSE):
             return g
     return FREE
 
@@ -200,9 +209,9 @@ def twin_of(T: Any, notes: Any, s: int, since: float) -> int:  # pragma: no cove
 def still_twin(T: Any, notes: Any, s: int, g: int) -> bool:  # pragma: no cover - compiled
     """Whether slot s may still be a second track of party g."""
     other = T.party[g].slot
-    error = math.sqrt(notes[other].noise + notes[s].noise)
-    beside = TWIN_BESIDE + STILL_ERRORS * error
-    return not notes[other].seen or together(notes[other], notes[s], 1.5 * TWIN_AHEAD, beside)
+    if not notes[other].seen:
+        return later(notes[s], notes[other])
+    return together(notes[s], notes[other], 1.0)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -217,7 +226,25 @@ def meet_(
     g = 0
     while g < N_GUIDES and T.party[g].slot != FREE:
         g += 1
-    if g == N_GUIDES or T.n + MOST_FIRST > N_LOCAL:
+    if g == N_GUIDES:
+        return FREE
+    # where the road leads, and so in which lane it is, each global hypothesis says for itself
+    lane_row_(T.h, T.x[WAY], notes[s].x)
+    places = np.empty(T.n_global)
+    for k in range(T.n_global):
+        y = notes[s].y
+        for i in range(N_ROAD):
+            y -= T.h[i] * (T.x[i] + beyond(T, k, i))
+        places[k] = y / (T.x[WIDTH] + beyond(T, k, WIDTH))
+    middle = math.floor(places[best_global(T)] + 0.5)
+    lanes, n_lanes, courses = np.empty(MOST_LANES, np.int64), 0, 0
+    for aside in range(MOST_LANES):
+        lane = middle + aside - MOST_LANES // 2
+        if np.abs(places - lane).min() <= 1.5:
+            lanes[n_lanes] = lane
+            n_lanes += 1
+            courses += 1 + count_first(places, lane)
+    if T.n + courses > N_LOCAL:
         return FREE
     party = T.party[g]
     party.slot, party.unseen, party.outliers, party.since = s, 0.0, 0, t
@@ -227,23 +254,13 @@ def meet_(
     forget_wander_(party, par)
     T.P[a, a] = party.beside**2
     T.P[a + 1, a + 1] = (par[P_BESIDE_RATE] * party.beside) ** 2
-    lane_row_(T.h, T.x[WAY], notes[s].x)
-    # where the road leads, and so in which lane it is, each global hypothesis says for itself
-    places = np.empty(T.n_global)
-    for k in range(T.n_global):
-        y = notes[s].y
-        for i in range(N_ROAD):
-            y -= T.h[i] * (T.x[i] + beyond(T, k, i))
-        places[k] = y / (T.x[WIDTH] + beyond(T, k, WIDTH))
-    middle = math.floor(places[best_global(T)] + 0.5)
-    first = T.n
-    for to in range(middle - LANES_ASIDE, middle + LANES_ASIDE + 1):
-        if np.abs(places - to).min() > 1.5:
-            continue
-        q = add_local_(T, g, to, 0, False, 0.0, 0.0, -1)
+    for lane in lanes[:n_lanes]:
+        q = add_local_(T, g, lane, 0, False, 0.0, 0.0, -1)
         for k in range(T.n_global):
             T.odds[k, q] = 0.0
-            if q == first or abs(places[k] - to) < abs(places[k] - T.local[T.choice[k, g]].lane):
+            if lane == lanes[0] or (
+                abs(places[k] - lane) < abs(places[k] - T.local[T.choice[k, g]].lane)
+            ):
                 T.choice[k, g] = q
     begin_courses_(T, g, t, par, places)
     return g
@@ -373,7 +390,7 @@ def watch_(
         if gone or notes[s].new or T.party[g].unseen > UNSEEN_S:
             leave_(T, guide_of, g)
         elif notes[s].seen and t - T.party[g].since <= TWIN_S:
-            twin = twin_of(T, notes, s, T.party[g].since)
+            twin = twin_of(T, notes, s)
             if twin != FREE:
                 leave_(T, guide_of, g)
                 guide_of[s] = twin
@@ -401,7 +418,7 @@ def watch_(
     # the nearest first: they show where the others' lanes are
     for k in new[np.argsort(np.array([abs(notes[slot[k]].x) for k in new[:n_new]]))]:
         s = slot[k]
-        guide_of[s] = g = twin_of(T, notes, s, t)
+        guide_of[s] = g = twin_of(T, notes, s)
         if g != FREE:
             continue
         g = meet_(T, par, guide_of, notes, s, t)
@@ -409,7 +426,7 @@ def watch_(
             see_(T, guide_of, notes[s], g, v, t, z[k], r[k], valid[k], angle[k])
             split_(T)
     if t - T.party[EGO].begun >= apart:
-        begin_courses_(T, np.int64(EGO), t, par, nowhere)
+        begin_courses_(T, EGO, t, par, nowhere)
     consider_(T, t, par)
 
 

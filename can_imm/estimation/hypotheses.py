@@ -36,10 +36,8 @@ LOG_P: FloatArray = np.tile(_LOG_P - np.log(np.sum(np.exp(_LOG_P))), 2)
 such at a constant rate."""
 N_BEGUN = 6
 """Lane changes that had begun before a vehicle was first seen are tried from so many beginnings."""
-MOST_LANES = 5
-"""In so many lanes a vehicle may be that is first seen."""
-MOST_FIRST = MOST_LANES * (1 + 2 * len(LASTS) * N_BEGUN)
-"""Most courses of a vehicle that is first seen."""
+FOR_NEW = 1400
+"""Room for so many courses is left to vehicles that are first seen: one at least."""
 APART = 0.07
 """Courses begin so long one after the other [s], and longer where many vehicles are followed."""
 IMPOSSIBLE = 13.5
@@ -83,6 +81,20 @@ def add_local_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def passes(places: FloatArray, lane: int, turn: int) -> bool:  # pragma: no cover - compiled
+    """Whether a vehicle that is first seen at ``places``, in lanes, may be on its way there."""
+    return bool(np.abs(places - (lane + 0.5 * turn)).min() <= 1.0)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def count_first(places: FloatArray, lane: int) -> int:  # pragma: no cover - compiled
+    """How many courses from a lane `begin_courses_` adds at most for a vehicle that is first seen
+    at ``places``."""
+    sides = int(passes(places, lane, -1)) + int(passes(places, lane, 1))
+    return sides * len(LASTS) * N_BEGUN
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def begin_courses_(
     T: Any, who: int, t: float, par: FloatArray, places: FloatArray
 ) -> None:  # pragma: no cover - compiled
@@ -106,11 +118,12 @@ def begin_courses_(
             likely |= T.odds[g, like] > -RARE
         if not likely:
             continue
-        if T.n + 2 * len(LASTS) * (N_BEGUN if first else 1) > N_LOCAL:
-            return
         lane = one.lane + one.turn
+        more = count_first(places, lane) if first else 2 * len(LASTS) + FOR_NEW
+        if T.n + more > N_LOCAL:
+            return
         for turn in (-1, 1):
-            if first and np.abs(places - (lane + 0.5 * turn)).min() > 1.0:
+            if first and not passes(places, lane, turn):
                 continue
             for i in range(len(LASTS)):
                 steady = i >= N_DURATIONS
@@ -347,7 +360,7 @@ def consider_(T: Any, t: float, par: FloatArray) -> None:  # pragma: no cover - 
         settle_(T, who, t, par[P_SETTLE])
     split_(T)
     drop_globals_(T)
-    drop_locals_(T, np.int64(-1))
+    drop_locals_(T, -1)
     centre_(T)
 
 

@@ -66,7 +66,7 @@ EGO = N_GUIDES
 N_PARTIES = N_GUIDES + 1
 N = N_ROAD + 2 * N_GUIDES
 """Length of the state: the road, and of each vehicle its place beside its course and the rate."""
-N_LOCAL = 4096
+N_LOCAL = 6144
 """Most local hypotheses, of all parties together."""
 N_GLOBAL = 12
 """Most global hypotheses."""
@@ -300,6 +300,9 @@ TINY = 1e-7
 measurements."""
 LEAST_SHARE = 1e-4
 """A hypothesis that is less probable does not count for the road."""
+SPREADS = 0.01
+"""Nor do within a global one that is less probable the differences between a party's courses count
+for what is known of the road."""
 MOST_LOST = 40.0
 """A squared normalised error counts as this at most."""
 
@@ -454,7 +457,7 @@ def drive_(
                     T.shift[q] = (slope - its_slope) * width / speed
                 else:
                     T.shift[q] = (its_bend - bend) * width / speed
-        measure_(T, m, z, r, np.int64(EGO), np.inf)
+        measure_(T, m, z, r, EGO, np.inf)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -474,7 +477,7 @@ def turn_with_road_(
     """The ego turns as the road does; in place."""
     if speed == speed and yaw_rate == yaw_rate:
         m = turn_row_(T, speed)
-        measure_(T, np.int64(m), yaw_rate, par[P_TURN_STD] ** 2, np.int64(NOBODY), np.inf)
+        measure_(T, m, yaw_rate, par[P_TURN_STD] ** 2, NOBODY, np.inf)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -525,30 +528,38 @@ def summarise_(T: Any, road: FloatArray, P: FloatArray) -> None:  # pragma: no c
             continue
         shares_(T, g, share, total)
         part[:, :] = 0.0
+        spreads = w[g] >= SPREADS
         for q in range(T.n):
             if share[q] < LEAST_SHARE:
                 continue
-            who = T.local[q].who
+            who, mean = T.local[q].who, T.mean[q]
             for i in range(N_ROAD):
-                v = share[q] * T.mean[q, i]
-                part[who, i] += v
-                for j in range(N_ROAD):
-                    P[i, j] += w[g] * v * T.mean[q, j]
+                part[who, i] += share[q] * mean[i]
+            if not spreads:
+                continue
+            for i in range(N_ROAD):
+                u = w[g] * share[q] * mean[i]
+                for j in range(i + 1):
+                    P[i, j] += u * mean[j]
         for i in range(N_ROAD):
             means[g, i] = T.rest[g, i]
         for p in range(N_PARTIES):
+            if T.choice[g, p] == FREE:
+                continue
             for i in range(N_ROAD):
                 means[g, i] += part[p, i]
-                for j in range(N_ROAD):
-                    P[i, j] -= w[g] * part[p, i] * part[p, j]
+                if spreads:
+                    for j in range(i + 1):
+                        P[i, j] -= w[g] * part[p, i] * part[p, j]
     for i in range(N_ROAD):
         road[i] = 0.0
         for g in range(T.n_global):
             road[i] += w[g] * means[g, i]
-    for g in range(T.n_global):
-        for i in range(N_ROAD):
-            for j in range(N_ROAD):
+    for i in range(N_ROAD):
+        for j in range(i + 1):
+            for g in range(T.n_global):
                 P[i, j] += w[g] * (means[g, i] - road[i]) * (means[g, j] - road[j])
+            P[j, i] = P[i, j]
     for i in range(N_ROAD):
         road[i] += T.x[i]
 

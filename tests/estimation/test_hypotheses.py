@@ -748,9 +748,13 @@ def test_who_leaves_takes_nothing_along(seed: int, gone: int) -> None:
     assert T["top"] == N_ROAD + (4 if gone == 2 else 6)
 
 
-@pytest.mark.parametrize("room", [0, 3, hy.MOST_FIRST - 1, hy.MOST_FIRST])
+NEEDED = 3 + 2 * 2 * hy.N_BEGUN * len(hy.LASTS)
+"""In one of three lanes, or to either side between two pairs of them."""
+
+
+@pytest.mark.parametrize("room", [0, 3, NEEDED - 1, NEEDED, hy.FOR_NEW])
 def test_without_room_for_all_its_courses_nobody_is_met(room: int) -> None:
-    """Others stay as they are."""
+    """Others stay as they are, and leave room for somebody new."""
     traffic = Traffic(parameters())
     for _ in range(10):
         traffic.scan([0, 1], [[30.0, 0.0], [50.0, WIDTH]], speed=25.0, yaw_rate=0.0)
@@ -764,8 +768,10 @@ def test_without_room_for_all_its_courses_nobody_is_met(room: int) -> None:
     notes = np.zeros(32, NOTE_DTYPE)
     notes["x"][4], notes["y"][4], notes["noise"][4], notes["seen"][4] = 40.0, -3.4, 0.01, True
     before = traffic.frame.x.copy()
+    hy.begin_courses_(T, 0, 1e-9 * traffic.t_ns + 0.1, parameters(), np.zeros(0))
+    assert T["n"] == full
     got = meet_(T, parameters(), traffic.guide_of, notes, 4, 1e-9 * traffic.t_ns)
-    met = room == hy.MOST_FIRST
+    met = room >= NEEDED
     assert got == (2 if met else tr.FREE)
     assert traffic.guide_of[4] == got
     assert (T["party"]["slot"][2] == 4) == met
