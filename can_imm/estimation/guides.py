@@ -195,7 +195,7 @@ def twin_of(T: Any, notes: Any, s: int) -> int:  # pragma: no cover - compiled
     """
     for g in range(N_GUIDES):
         other = T.party[g].slot
-        if other in (FREE, s) or not notes[other].seen:
+        if other == s or other == FREE or not notes[other].seen:  # noqa: SIM109 - unknown to numba
             continue
         follows = later(notes[s], notes[other])
         if not (follows or notes[s].new):
