@@ -37,7 +37,8 @@ such at a constant rate."""
 N_BEGUN = 6
 """Lane changes that had begun before a vehicle was first seen are tried from so many beginnings."""
 FOR_NEW = 1400
-"""Room for so many courses is left to vehicles that are first seen: one at least."""
+"""Room for so many courses is left to vehicles that are first seen: for one in any of
+`guides.MOST_LANES` lanes."""
 APART = 0.07
 """Courses begin so long one after the other [s], and longer where many vehicles are followed."""
 IMPOSSIBLE = 13.5
@@ -53,7 +54,7 @@ LATE = 20.0
 SAME = 1e-6
 """What is likelier by no more is as likely: rounding decides nothing."""
 SPLITS = 3
-"""Most global hypotheses that are made in one scan."""
+"""Most global hypotheses that are made at a time."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
