@@ -19,6 +19,7 @@ MEMORY_DTYPE = np.dtype(
         ("kept", np.int16),
         ("left", np.int16),
         ("changing", np.bool_),
+        ("belief", np.float64),
     ],
     align=True,
 )
@@ -45,27 +46,34 @@ def hesitate_(
 ) -> None:  # pragma: no cover - compiled
     """Say that a lane change has begun only when that is sure, in place.
 
-    Most of what is a lane change by a narrow margin is a vehicle that wanders in its lane, and soon
-    goes back.  Until it is ``sure`` the second most probable manoeuvre is said; a lane change that
-    was said stays until another manoeuvre is more probable.  Other arguments as for `relate_`.
+    Most of what is a lane change by a narrow margin and for a moment is a vehicle that wanders in
+    its lane.  So what its probability is above one half is summed up over the scans, as in a
+    cumulative sum test (Page, 1954).  Until the sum is ``sure`` the second most probable manoeuvre
+    is said; a lane change that was said stays until another manoeuvre is more probable.  Other
+    arguments as for `relate_`.
     """
     k = 0
     for s in range(ids.shape[0]):
         if ids[s] < 0:
             continue
-        report = reports[k]
+        report, m = reports[k], memory[s]
         k += 1
         if report.age <= 1:
-            memory[s].changing = False
+            m.changing = False
+            m.belief = 0.0
         changing = report.manoeuvre == _LANE_CHANGE
-        if changing and not memory[s].changing and report.probability < sure:
-            changing = False
-            p = report.probability
-            report.manoeuvre, report.second = report.second, report.manoeuvre
-            report.probability = report.second_probability
-            report.second_probability = p
-            report.direction = 0
-        memory[s].changing = changing
+        if not changing or m.changing:
+            m.belief = 0.0
+        else:
+            m.belief = max(m.belief + report.probability - 0.5, 0.0)
+            if m.belief < sure:
+                changing = False
+                p = report.probability
+                report.manoeuvre, report.second = report.second, report.manoeuvre
+                report.probability = report.second_probability
+                report.second_probability = p
+                report.direction = 0
+        m.changing = changing
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

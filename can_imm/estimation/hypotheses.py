@@ -39,7 +39,7 @@ N_BEGUN = 6
 FOR_NEW = 1400
 """Room for so many courses is left to vehicles that are first seen: for one in any of
 `guides.MOST_LANES` lanes."""
-APART = 0.07
+APART = 0.06
 """Courses begin so long one after the other [s], and longer where many vehicles are followed."""
 IMPOSSIBLE = 13.5
 """What is less likely than the best by this, as a logarithm, is given up."""
@@ -81,6 +81,13 @@ def add_local_(
     return q
 
 
+TRUST = 0.5
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def steady_share(T: Any, par: FloatArray) -> float:  # pragma: no cover - compiled
+    """How many of the lane changes are at a constant rate, by those that have ended."""
+    return float((TRUST * par[P_CHANGE_STEADY] + T.ended[1]) / (TRUST + T.ended[0] + T.ended[1]))
+
+
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def passes(places: FloatArray, lane: int, turn: int) -> bool:  # pragma: no cover - compiled
     """Whether a vehicle that is first seen at ``places``, in lanes, may be on its way there."""
@@ -107,6 +114,7 @@ def begin_courses_(
             first time: then those under way that pass there are added; else (0,).
     """
     first = len(places) > 0
+    always = steady_share(T, par)
     since = t - T.party[who].begun
     T.party[who].begun = t
     n = T.n
@@ -128,7 +136,7 @@ def begin_courses_(
                 continue
             for i in range(len(LASTS)):
                 steady = i >= N_DURATIONS
-                share = par[P_CHANGE_STEADY] if steady else 1.0 - par[P_CHANGE_STEADY]
+                share = always if steady else 1.0 - always
                 for b in range(N_BEGUN if first else 1):
                     span = LASTS[i] / N_BEGUN if first else since
                     log_w = math.log(0.5 * par[P_CHANGE_RATE] * span * share) + LOG_P[i]
@@ -140,7 +148,9 @@ def begin_courses_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def settle_(T: Any, who: int, t: float, settle: float) -> None:  # pragma: no cover - compiled
+def settle_(
+    T: Any, who: int, t: float, settle: float, share: FloatArray
+) -> None:  # pragma: no cover - compiled
     """A course that ended ``settle`` seconds ago is one with the lane that it led to; in place."""
     for q in range(T.n):
         one = T.local[q]
@@ -149,6 +159,7 @@ def settle_(T: Any, who: int, t: float, settle: float) -> None:  # pragma: no co
         if one.turn != 0 and t - one.start >= one.duration + settle:
             one.lane += one.turn
             one.turn = 0
+            T.ended[1 if one.steady else 0] += share[q]
         if one.turn != 0:
             continue
         for p in range(q):
@@ -357,8 +368,9 @@ def centre_(T: Any) -> None:  # pragma: no cover - compiled
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def consider_(T: Any, t: float, par: FloatArray) -> None:  # pragma: no cover - compiled
     """After all measurements of a scan at time t [s]: settle, split, give up; in place."""
+    shares_(T, best_global(T), T.error, np.empty((N_PARTIES, 2)))
     for who in range(N_PARTIES):
-        settle_(T, who, t, par[P_SETTLE])
+        settle_(T, who, t, par[P_SETTLE], T.error)
     split_(T)
     drop_globals_(T)
     drop_locals_(T, -1)

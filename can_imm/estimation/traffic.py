@@ -94,6 +94,7 @@ TRAFFIC_DTYPE = np.dtype(
             (N_LOCAL,),
         ),
         ("mean", np.float64, (N_LOCAL, N)),
+        ("ended", np.float64, (2,)),
         ("n_global", np.int64),
         ("log_w", np.float64, (N_GLOBAL,)),
         ("choice", np.int32, (N_GLOBAL, N_PARTIES)),
