@@ -23,9 +23,10 @@ MEMORY_DTYPE = np.dtype(
     ],
     align=True,
 )
-"""What is remembered of a slot: ``changing`` a lane change was said of it; ``kept`` the lane it
-kept last, ``left`` the lane that it left to the left at ``left_ns`` (lanes by number, `NO_LANE` for
-none); ``twin`` slot of an object that has been in the same place for ``twin_scans`` scans."""
+"""What is remembered of a slot: ``changing`` a lane change was said of it, ``belief`` what speaks
+for one that was not said yet; ``kept`` the lane it kept last, ``left`` the lane that it left to the
+left at ``left_ns`` (lanes by number, `NO_LANE` for none); ``twin`` slot of an object that has been
+in the same place for ``twin_scans`` scans."""
 
 OVERTAKING_NS = 20_000_000_000
 """So long after a lane change to the left [ns] passing the other lane's vehicles is overtaking."""

@@ -76,7 +76,7 @@ class RoadFrame:
 
     @property
     def sure(self) -> float:
-        """How probable a lane change must be to be said; see `relations.hesitate_`."""
+        """How much must speak for a lane change before it is said; see `relations.hesitate_`."""
         return float(self._par[road.P_SURE])
 
     def _begin(self, t: float, width: float, width_var: float) -> None:

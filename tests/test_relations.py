@@ -73,20 +73,25 @@ def test_a_lane_change_is_said_when_it_is_sure_and_until_it_is_over() -> None:
         reports["manoeuvre"], reports["second"] = best, second
         reports["probability"], reports["second_probability"] = max(p, 1 - p), min(p, 1 - p)
         reports[0]["manoeuvre"], reports[0]["second"] = KEEP, Manoeuvre.RECEDING
-        hesitate_(ids, memory, 0.7, reports, 2)
+        hesitate_(ids, memory, 0.3, reports, 2)
         assert reports[0]["manoeuvre"] == KEEP
         one = reports[1]
         assert one["probability"] == pytest.approx(p if one["manoeuvre"] == CHANGE else 1 - p)
         assert one["second_probability"] == pytest.approx(1 - one["probability"])
         return one["manoeuvre"], one["second"], one["direction"]
 
-    assert said(0.6) == (KEEP, CHANGE, 0), "not yet"
-    assert said(0.71) == (CHANGE, KEEP, -1)
+    assert said(0.7) == (KEEP, CHANGE, 0), "not yet"
+    assert said(0.65) == (CHANGE, KEEP, -1), "twice is enough"
     assert said(0.51) == (CHANGE, KEEP, -1), "still"
     assert said(0.49)[0] == KEEP
     assert said(0.6)[0] == KEEP, "that would be another one"
-    assert said(0.9)[0] == CHANGE
-    assert said(0.6, age=1)[0] == KEEP, "another object in this slot"
+    assert said(0.4)[0] == KEEP
+    assert said(0.7)[0] == KEEP, "it was something else meanwhile"
+    assert said(0.79)[0] == CHANGE
+    assert said(0.2)[0] == KEEP
+    assert said(0.81)[0] == CHANGE, "sure at once"
+    assert said(0.7, age=1)[0] == KEEP, "another object in this slot"
+    assert said(0.65)[0] == CHANGE
 
 
 # ---- lanes

@@ -43,6 +43,9 @@ APART = 0.06
 """Courses begin so long one after the other [s], and longer where many vehicles are followed."""
 IMPOSSIBLE = 13.5
 """What is less likely than the best by this, as a logarithm, is given up."""
+TRUST = 0.5
+"""What is usual of lane changes counts as much as so many that were seen.  It is little: people's
+are all smooth, simulated ones often all at a constant rate."""
 RARE = 7.0
 """What is less likely by this begins no courses."""
 SPLIT = 4.0
@@ -81,11 +84,11 @@ def add_local_(
     return q
 
 
-TRUST = 0.5
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def steady_share(T: Any, par: FloatArray) -> float:  # pragma: no cover - compiled
-    """How many of the lane changes are at a constant rate, by those that have ended."""
-    return float((TRUST * par[P_CHANGE_STEADY] + T.ended[1]) / (TRUST + T.ended[0] + T.ended[1]))
+    """Share of the lane changes that are at a constant rate, by those that have ended."""
+    n = TRUST + T.ended[0] + T.ended[1]
+    return float((TRUST * par[P_CHANGE_STEADY] + T.ended[1]) / n)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -103,31 +106,59 @@ def count_first(places: FloatArray, lane: int) -> int:  # pragma: no cover - com
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def done(T: Any, q: int, who: int, t: float) -> bool:  # pragma: no cover - compiled
+    """Whether local hypothesis q is one of a party that has reached its lane at time t."""
+    one = T.local[q]
+    return bool(one.who == who and (one.turn == 0 or t - one.start >= one.duration))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def join_(
+    T: Any, who: int, lane: int, t: float, odds: FloatArray
+) -> int:  # pragma: no cover - compiled
+    """The likeliest of the courses that have brought a party to a lane until time t.
+
+    Args:
+        odds: (N_GLOBAL,) written: those of all of them together.
+    """
+    best, likeliest = best_global(T), -1
+    odds[:] = -np.inf
+    for q in range(T.n):
+        if done(T, q, who, t) and T.local[q].lane + T.local[q].turn == lane:
+            for g in range(T.n_global):
+                odds[g] = add_logs(odds[g], T.odds[g, q])
+            if likeliest < 0 or T.odds[best, q] > T.odds[best, likeliest]:
+                likeliest = q
+    return likeliest
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def begin_courses_(
     T: Any, who: int, t: float, par: FloatArray, places: FloatArray
 ) -> None:  # pragma: no cover - compiled
     """Add the courses of a party that may begin now; those from a lane all or, where there is no
-    room, none.
+    room, none.  However the party came to the lane, they begin as after the likeliest way there.
 
     Args:
         places: (n_global,) where it is, in lanes, by each global hypothesis if it is seen for the
             first time: then those under way that pass there are added; else (0,).
     """
     first = len(places) > 0
-    always = steady_share(T, par)
+    at_constant_rate = steady_share(T, par)
+    odds = np.empty(N_GLOBAL)
     since = t - T.party[who].begun
     T.party[who].begun = t
     n = T.n
-    for like in range(n):
-        one = T.local[like]
-        if one.who != who or (one.turn != 0 and t - one.start < one.duration):
+    reached, n_reached = np.empty(n, np.int64), 0
+    for p in range(n):
+        lane = T.local[p].lane + T.local[p].turn
+        if not done(T, p, who, t) or (reached[:n_reached] == lane).any():
             continue
-        likely = False
-        for g in range(T.n_global):
-            likely |= T.odds[g, like] > -RARE
-        if not likely:
+        reached[n_reached] = lane
+        n_reached += 1
+        like = join_(T, who, lane, t, odds)
+        if not odds[: T.n_global].max() > -RARE:
             continue
-        lane = one.lane + one.turn
         more = count_first(places, lane) if first else 2 * len(LASTS) + FOR_NEW
         if T.n + more > N_LOCAL:
             return
@@ -136,7 +167,7 @@ def begin_courses_(
                 continue
             for i in range(len(LASTS)):
                 steady = i >= N_DURATIONS
-                share = always if steady else 1.0 - always
+                share = at_constant_rate if steady else 1.0 - at_constant_rate
                 for b in range(N_BEGUN if first else 1):
                     span = LASTS[i] / N_BEGUN if first else since
                     log_w = math.log(0.5 * par[P_CHANGE_RATE] * span * share) + LOG_P[i]
@@ -144,14 +175,18 @@ def begin_courses_(
                         continue
                     q = add_local_(T, who, lane, turn, steady, t - (b + 0.5) * span, LASTS[i], like)
                     for g in range(T.n_global):
-                        T.odds[g, q] = T.odds[g, like] + log_w
+                        T.odds[g, q] = odds[g] + log_w
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def settle_(
     T: Any, who: int, t: float, settle: float, share: FloatArray
 ) -> None:  # pragma: no cover - compiled
-    """A course that ended ``settle`` seconds ago is one with the lane that it led to; in place."""
+    """A course that ended ``settle`` seconds ago is one with the lane that it led to; in place.
+
+    Args:
+        share: (N_LOCAL,) how probable the courses are.
+    """
     for q in range(T.n):
         one = T.local[q]
         if one.who != who:

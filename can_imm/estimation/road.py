@@ -82,8 +82,8 @@ seen.
 For `estimation.traffic`: ``beside_std`` [m] of a vehicle's place beside its course,
 ``beside_spread`` of its logarithm among vehicles, ``beside_rate`` [1/s]: how fast such a place is
 forgotten; ``change_rate`` [1/s] of lane changes, ``change_steady``: share of them at a constant
-rate, ``settle`` [s]: so long after it a lane change may still turn out to be none; ``sure``: see
-`relations.hesitate_`.
+rate before any was seen, ``settle`` [s]: so long after it a lane change may still turn out to be
+none; ``sure``: see `relations.hesitate_`.
 """
 (
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,

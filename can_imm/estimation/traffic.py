@@ -126,8 +126,9 @@ local hypotheses q = ``choice[g]`` of all parties; ``P`` covariance of all.
 
 ``n`` local hypotheses are in use: party ``who`` changes from ``lane`` (0 the ego's) by ``turn`` (+1
 left, -1 right, 0 none) from ``start`` on within ``duration`` [s], at a constant rate if ``steady``.
-``log_w`` logarithms of the weights of the ``n_global`` global hypotheses, ``odds`` what is to be
-added if one party had another course.
+``ended`` so many lane changes seem to have ended: smooth ones, such at a constant rate.  ``log_w``
+logarithms of the weights of the ``n_global`` global hypotheses, ``odds`` what is to be added if one
+party had another course.
 
 Of a party: the detector's ``slot``, `FREE` for none; so many ``outliers`` in a row; for how long it
 is ``unseen``, when courses have ``begun`` last, ``since`` when it is followed [s]; and how it

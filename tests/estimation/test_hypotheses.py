@@ -114,7 +114,8 @@ class WrittenOut:
 
     Each row of ``courses``: lane, turn, begin, duration.  What is less likely than the best by
     ``impossible`` ends, by ``rare`` begins nothing, and less probable from the start than
-    ``unborn`` is none.
+    ``unborn`` is none.  A change begins after each course that has ended; or, ``joined``, after all
+    of those that led to the same lane, as after the likeliest.
     """
 
     def __init__(
@@ -125,6 +126,7 @@ class WrittenOut:
         impossible: float = hy.IMPOSSIBLE,
         rare: float = hy.RARE,
         unborn: float = hy.IMPOSSIBLE,
+        joined: bool = True,
     ) -> None:
         n = len(t)
         used = np.arange(0, 2 * n, 1 if vy is not None else 2)
@@ -157,8 +159,14 @@ class WrittenOut:
                     (way(u, steady[i, None]), rate(u, steady[i, None]) / lasts[i, None]), axis=2
                 )
                 more = [(courses, means, misfit, log_w)]
-                for q in np.flatnonzero(ended & (log_w > log_w.max() - rare)):
-                    lane = courses[q, 0] + courses[q, 1]
+                free, reached = np.flatnonzero(ended), courses[:, 0] + courses[:, 1]
+                groups = [free[reached[free] == lane] for lane in np.unique(reached[free])]
+                for those in groups if joined else free[:, None]:
+                    total = np.logaddexp.reduce(log_w[those])
+                    if total <= log_w.max() - rare:
+                        continue
+                    q = those[np.argmax(log_w[those])]
+                    lane = reached[q]
                     for turn in (-1, 1):
                         if first and abs(y[0] / WIDTH - lane - 0.5 * turn) > 1.0:
                             continue
@@ -169,7 +177,7 @@ class WrittenOut:
                             np.hstack((lane * one, turn * one, start[:, None], lasts[i, None])),
                             its,
                             ((z - its[:, used]) @ whiten.T) ** 2,
-                            log_w[q] + log_prior[i],
+                            total + log_prior[i],
                         ))  # fmt: skip
                 courses, means, misfit, log_w = (np.concatenate(a) for a in zip(*more, strict=True))
             now = misfit[:, k * each : (k + 1) * each]
@@ -268,7 +276,7 @@ def test_it_costs_little_that_most_hypotheses_are_given_up(case: Case, with_spee
     dt, t, y, vy = drive(case)
     speeds = vy if with_speed else None
     p = follow_each(dt, y, speeds)[1]
-    off = abs(p - WrittenOut(t, y, speeds, 20.0, 14.0, 25.0).scan_by_scan())
+    off = abs(p - WrittenOut(t, y, speeds, 20.0, 14.0, 25.0, False).scan_by_scan())
     assert off.max() < 0.01
     assert off.mean() < 2e-4
 
@@ -290,6 +298,35 @@ def test_a_course_that_settled_is_one_with_its_lane(case: Case) -> None:
     assert len(set(lanes.tolist())) == len(lanes)
     best = T["local"][T["choice"][tr.best_global(T), 0]]
     assert (best["lane"], best["turn"]) == (case[0] + case[1], 0)
+
+
+@pytest.mark.parametrize("steady", [True, False])
+def test_what_lane_changes_are_like_is_learnt(steady: bool) -> None:
+    """By those that have ended: so many, and most of them at a constant rate or not."""
+    traffic = Drive(known_road(settle=1.0))
+    T = traffic.filter
+    assert hy.steady_share(T, known_road()) == pytest.approx(STEADY)
+    rng = np.random.default_rng(2)
+    lasts = 3.0 if steady else 4.3
+    for k in range(300):
+        t, begins = 0.1 * k, np.array([3.0, 12.0, 21.0])
+        u = (t - begins) / lasts
+        y = WIDTH * way(u, steady) @ [1, -1, 1] + rng.normal(0.0, STD)
+        vy = WIDTH / lasts * rate(u, steady) @ [1, -1, 1] + rng.normal(0.0, STD)
+        traffic.see([0], [40.0, y], vy, std=STD)
+        if k in (115, 205):
+            assert T["ended"].sum() == pytest.approx(k // 90, abs=0.1)
+    assert T["ended"].sum() == pytest.approx(3.0, abs=0.1)
+    assert T["ended"][int(steady)] > 2.7
+    share = hy.steady_share(T, known_road())
+    n = hy.TRUST + T["ended"].sum()
+    assert share == pytest.approx((hy.TRUST * STEADY + T["ended"][1]) / n)
+    before = int(T["n"])
+    hy.begin_courses_(T, 0, 1e-9 * traffic.t_ns + 0.1, known_road(), np.zeros(0))
+    born = T["local"][before : T["n"]]
+    p = np.exp(T["odds"][0, before : T["n"]])
+    left = born["turn"] > 0
+    assert p[born["steady"] & left].sum() / p[left].sum() == pytest.approx(share, abs=0.01)
 
 
 @pytest.mark.parametrize("n", [1, 2])
