@@ -51,7 +51,7 @@ LEAST_STEP = 1.0
 """Points of the road's line are so far apart [m]."""
 AHEAD: FloatArray = np.arange(4.0, 304.0, 4.0)
 """Beyond the ego's last place the line goes on for so long [m]."""
-AHEAD_COV: FloatArray = np.diag(np.square([0.002, 1e-4, 1.5e-6]))
+AHEAD_COV: FloatArray = np.diag(np.square([0.002, 3e-4, 1.5e-6]))
 """How wrong the filter may be about the road ahead: direction [rad], curvature [1/m], and the
 change of that [1/m²]."""
 AHEAD_STEP_S = 0.5

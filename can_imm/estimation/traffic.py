@@ -95,6 +95,8 @@ TRAFFIC_DTYPE = np.dtype(
         ),
         ("mean", np.float64, (N_LOCAL, N)),
         ("ended", np.float64, (2,)),
+        ("bends", np.float64),
+        ("driven", np.float64),
         ("n_global", np.int64),
         ("log_w", np.float64, (N_GLOBAL,)),
         ("choice", np.int32, (N_GLOBAL, N_PARTIES)),
@@ -126,9 +128,10 @@ local hypotheses q = ``choice[g]`` of all parties; ``P`` covariance of all.
 
 ``n`` local hypotheses are in use: party ``who`` changes from ``lane`` (0 the ego's) by ``turn`` (+1
 left, -1 right, 0 none) from ``start`` on within ``duration`` [s], at a constant rate if ``steady``.
-``ended`` so many lane changes seem to have ended: smooth ones, such at a constant rate.  ``log_w``
-logarithms of the weights of the ``n_global`` global hypotheses, ``odds`` what is to be added if one
-party had another course.
+``ended`` so many lane changes seem to have ended: smooth ones, such at a constant rate; ``bends``
+squares of the curvature [1/m²] by the road ``driven``, see `learn_curvature_`.  ``log_w`` logarithms
+of the weights of the ``n_global`` global hypotheses, ``odds`` what is to be added if one party had
+another course.
 
 Of a party: the detector's ``slot``, `FREE` for none; so many ``outliers`` in a row; for how long it
 is ``unseen``, when courses have ``begun`` last, ``since`` when it is followed [s]; and how it
@@ -305,6 +308,9 @@ LEAST_SHARE = 1e-4
 SPREADS = 0.01
 """Nor do within a global one that is less probable the differences between a party's courses count
 for what is known of the road."""
+ROAD_TRUST, ROAD_MEMORY = 0.5, 8.0
+"""How bent roads usually are counts as much as what is seen of a road of the first length, and what
+was seen counts for the second, both in units of how long the curvature stays the same."""
 MOST_LOST = 40.0
 """A squared normalised error counts as this at most."""
 
@@ -342,6 +348,25 @@ def pass_knot_(rows: FloatArray, n: int, memory: float) -> None:  # pragma: no c
         for i in range(KNOT, last):
             rows[q, i] = rows[q, i + 1]
         rows[q, last] = memory * rows[q, last - 1]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def learn_curvature_(T: Any, driven: float) -> None:  # pragma: no cover - compiled
+    """Take in the curvature at the first knot, which the ego passes; in place.
+
+    Args:
+        driven: since the knot before, in units of how long the curvature stays the same.
+    """
+    fade = math.exp(-driven / ROAD_MEMORY)
+    T.driven = fade * T.driven + driven
+    T.bends = fade * T.bends + driven * (T.x[KNOT] ** 2 + T.P[KNOT, KNOT])
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def usual_curvature(T: Any, par: FloatArray) -> float:  # pragma: no cover - compiled
+    """Standard deviation of the road's curvature [1/m], by the road that was driven."""
+    squares = ROAD_TRUST * par[P_CURVATURE_STD] ** 2 + T.bends
+    return float(math.sqrt(squares / (ROAD_TRUST + T.driven)))
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -405,14 +430,16 @@ def predict_traffic_(
     x[WAY] = max(x[WAY] + v * dt, 0.0)
     while x[WAY] >= SPACING:
         x[WAY] -= SPACING
-        memory = math.exp(-SPACING / par[P_CURVATURE_LENGTH])
+        driven = SPACING / par[P_CURVATURE_LENGTH]
+        learn_curvature_(T, driven)
+        memory = math.exp(-driven)
         pass_knot_(x.reshape(1, N), 1, memory)
         pass_knot_(T.mean, n, memory)
         pass_knot_(T.rest, n_global, memory)
         pass_knot_(P, top, memory)
         pass_knot_(P.T, top, memory)
         last = N_ROAD - 1
-        P[last, last] += par[P_CURVATURE_STD] ** 2 * (1.0 - memory**2)
+        P[last, last] += usual_curvature(T, par) ** 2 * (1.0 - memory**2)
     drive_(T, par, dt, t, v, yaw_rate if known else np.nan)
 
 
