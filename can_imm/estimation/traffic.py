@@ -129,9 +129,8 @@ local hypotheses q = ``choice[g]`` of all parties; ``P`` covariance of all.
 ``n`` local hypotheses are in use: party ``who`` changes from ``lane`` (0 the ego's) by ``turn`` (+1
 left, -1 right, 0 none) from ``start`` on within ``duration`` [s], at a constant rate if ``steady``.
 ``ended`` so many lane changes seem to have ended: smooth ones, such at a constant rate; ``bends``
-squares of the curvature [1/m²] by the road ``driven``, see `learn_curvature_`.  ``log_w`` logarithms
-of the weights of the ``n_global`` global hypotheses, ``odds`` what is to be added if one party had
-another course.
+and ``driven``: see `learn_curvature_`.  ``log_w`` logarithms of the weights of the ``n_global``
+global hypotheses, ``odds`` what is to be added if one party had another course.
 
 Of a party: the detector's ``slot``, `FREE` for none; so many ``outliers`` in a row; for how long it
 is ``unseen``, when courses have ``begun`` last, ``since`` when it is followed [s]; and how it
@@ -189,6 +188,7 @@ def begin_traffic_(T: Any, par: FloatArray, t: float, width: float, width_var: f
     T["choice"][0, EGO] = 0
     T["rest"][:] = 0.0
     T["log_w"][:] = 0.0
+    T["ended"][:] = T["bends"] = T["driven"] = 0.0
     T["n_global"] = T["n"] = 1
     T["local"][0] = (0.0, 0.0, EGO, 0, 0, False)
     T["mean"][0] = 0.0
@@ -352,7 +352,8 @@ def pass_knot_(rows: FloatArray, n: int, memory: float) -> None:  # pragma: no c
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def learn_curvature_(T: Any, driven: float) -> None:  # pragma: no cover - compiled
-    """Take in the curvature at the first knot, which the ego passes; in place.
+    """Take in the curvature at the first knot, which the ego passes: ``driven`` sums up lengths of
+    road, ``bends`` them times the squares of the curvature there [1/m²]; in place.
 
     Args:
         driven: since the knot before, in units of how long the curvature stays the same.

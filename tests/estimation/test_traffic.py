@@ -333,6 +333,22 @@ def test_before_anything_is_seen_every_place_bends_alike() -> None:
         assert not T["x"][KNOT:N_ROAD].any()
 
 
+@pytest.mark.parametrize("bend", [0.0, 0.0005, 0.002])
+def test_how_bent_the_road_is_is_learnt_by_driving(bend: float) -> None:
+    """And forgotten: what was driven long ago does not count."""
+    par = parameters(curvature_length=100.0, **LOOSE)
+    T = with_road(*road.new_road(par), par)
+    assert traffic.usual_curvature(T, par) == pytest.approx(0.001)
+    weights = 0.25 * np.exp(-0.25 / traffic.ROAD_MEMORY * np.arange(400))
+    weight = weights.sum() / (weights.sum() + traffic.ROAD_TRUST)
+    for kappa in (bend, 0.001):
+        for _ in weights:
+            T["x"][KNOT], T["P"][KNOT, KNOT] = 0.6 * kappa, (0.8 * kappa) ** 2
+            traffic.learn_curvature_(T, 0.25)
+        expected = math.sqrt(weight * kappa**2 + (1.0 - weight) * 0.001**2)
+        assert traffic.usual_curvature(T, par) == pytest.approx(expected, rel=1e-5)
+
+
 def test_without_a_yaw_rate_the_bend_says_nothing_of_the_heading() -> None:
     before = random_road(np.random.default_rng(1))
     P, par = known_way(np.eye(N_ROAD)), nothing_but_motion()
@@ -356,10 +372,26 @@ def matern(beside: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
     return F, F @ e[:2, 2:]
 
 
+def driven_by(T: Any, knots: int, length: float) -> float:
+    """Standard deviation of the curvature when the ego has passed so many knots more: the mean of
+    the squares of those passed, the longer ago the less, and of what is usual."""
+    ago = SPACING / length * np.arange(knots)[::-1]
+    fade = np.exp(-ago / traffic.ROAD_MEMORY)
+    passed = np.arange(KNOT, KNOT + knots)
+    squares = T["x"][passed] ** 2 + np.diag(T["P"])[passed]
+    older = math.exp(-knots * SPACING / length / traffic.ROAD_MEMORY)
+    weights = np.array([
+        traffic.ROAD_TRUST, older * T["driven"], *(SPACING / length * fade)
+    ])  # fmt: skip
+    known = T["bends"] / T["driven"] if T["driven"] > 0.0 else 0.0
+    return math.sqrt(np.average([USUAL["curvature_std"] ** 2, known, *squares], weights=weights))
+
+
 def motion(
-    way: float, dt: float, speed: float, yaw_rate: float, guides: dict[int, float]
+    T: Any, dt: float, speed: float, yaw_rate: float, guides: dict[int, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """F (N, N), u (N,) and Q (N, N): the state becomes F x + u, and Q is its noise."""
+    way, passed = T["x"][WAY], 0
     known = not math.isnan(speed + yaw_rate)
     v = road.USUAL_SPEED if math.isnan(speed) else speed
     F, u, Q = np.eye(N), np.zeros(N), np.zeros((N, N))
@@ -389,7 +421,9 @@ def motion(
         A[LAST, LAST] = memory
         F, u, Q = A @ F, A @ u, A @ Q @ A.T
         u[WAY] -= SPACING
-        Q[LAST, LAST] += USUAL["curvature_std"] ** 2 * (1.0 - memory**2)
+        passed += 1
+        std = driven_by(T, passed, USUAL["curvature_length"])
+        Q[LAST, LAST] += std**2 * (1.0 - memory**2)
     return F, u, Q
 
 
@@ -402,7 +436,7 @@ def test_the_covariance_moves_with_the_state(seed: int, known: bool, way: float,
     T = crowd(np.random.default_rng(seed), par)
     T["x"][WAY] = way
     yaw_rate = 0.02 if known else NAN
-    F, u, Q = motion(way, dt, 30.0, yaw_rate, PARTIES)
+    F, u, Q = motion(T, dt, 30.0, yaw_rate, PARTIES)
     expected = [F @ mean_of(T, g, chosen) + u for g, chosen in enumerate(GLOBALS)]
     expected_P = F @ T["P"] @ F.T + Q
     traffic.predict_traffic_(T, par, dt, dt, 30.0, yaw_rate)
@@ -421,7 +455,11 @@ def test_noise_of_the_motion(known: bool, way: float) -> None:
     _, P = moved(x, CERTAIN, parameters(**LOOSE), 0.1, 20.0, 0.0 if known else NAN)
     assert P[HEADING, HEADING] == pytest.approx((1e-3 if known else 1e-2) ** 2 * 0.1, rel=1e-6)
     assert P[OFFSET, OFFSET] == pytest.approx(0.05**2 * 0.1, rel=1e-6)
-    new = 0.001**2 * (1.0 - math.exp(-2.0 * SPACING / 1000.0)) if way + 2.0 > SPACING else 0.0
+    new = 0.0
+    if way + 2.0 > SPACING:
+        straight = SPACING / 1000.0
+        usual = 0.001**2 * traffic.ROAD_TRUST / (traffic.ROAD_TRUST + straight)
+        new = usual * (1.0 - math.exp(-2.0 * SPACING / 1000.0))
     assert P[LAST, LAST] == pytest.approx(new, rel=1e-6)
     assert P[BIAS, BIAS] == pytest.approx(0.005**2 * (1.0 - math.exp(-0.2 / 120.0)), rel=1e-6)
     assert P[MOUNTING, MOUNTING] == P[WIDTH, WIDTH] == P[WAY, WAY] == 0.0
@@ -655,7 +693,7 @@ class Both:
         dt = self.rng.choice([0.03, 0.1, 0.5])
         speed, yaw_rate = self.rng.choice([NAN, 5.0, 30.0]), self.rng.choice([NAN, 0.0, 0.02])
         self.t += dt
-        F, u, Q = motion(self.T["x"][WAY], dt, speed, yaw_rate, PARTIES)
+        F, u, Q = motion(self.T, dt, speed, yaw_rate, PARTIES)
         traffic.predict_traffic_(self.T, self.par, dt, self.t, speed, yaw_rate)
         for one in self.dense.values():
             one.predict(F, u, Q)
@@ -923,7 +961,7 @@ def test_the_egos_habits(chosen: int, speed: float, yaw_rate: float, dt: float) 
     t = 0.0
     for _ in range(round(2.6 / dt)):
         t += dt
-        F, u, Q = motion(T["x"][WAY], dt, speed, yaw_rate, {})
+        F, u, Q = motion(T, dt, speed, yaw_rate, {})
         traffic.predict_traffic_(T, par, dt, t, speed, yaw_rate)
         for one, filt in zip(EGOS, dense, strict=True):
             filt.predict(F, u, Q)
