@@ -179,14 +179,19 @@ def begin_courses_(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def settle_(
-    T: Any, who: int, t: float, settle: float, share: FloatArray
-) -> None:  # pragma: no cover - compiled
-    """A course that ended ``settle`` seconds ago is one with the lane that it led to; in place.
+def total_odds(T: Any, g: int, who: int) -> float:  # pragma: no cover - compiled
+    """Odds in global hypothesis g of all courses of a party together."""
+    total = -np.inf
+    for q in range(T.n):
+        if T.local[q].who == who:
+            total = add_logs(total, T.odds[g, q])
+    return float(total)
 
-    Args:
-        share: (N_LOCAL,) how probable the courses are.
-    """
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def settle_(T: Any, who: int, t: float, settle: float) -> None:  # pragma: no cover - compiled
+    """A course that ended ``settle`` seconds ago is one with the lane that it led to; in place."""
+    best, total = best_global(T), np.nan
     for q in range(T.n):
         one = T.local[q]
         if one.who != who:
@@ -194,13 +199,16 @@ def settle_(
         if one.turn != 0 and t - one.start >= one.duration + settle:
             one.lane += one.turn
             one.turn = 0
-            T.ended[1 if one.steady else 0] += share[q]
+            if total != total:
+                total = total_odds(T, best, who)
+            T.ended[1 if one.steady else 0] += math.exp(T.odds[best, q] - total)
         if one.turn != 0:
             continue
         for p in range(q):
             other = T.local[p]
             if other.who == who and other.turn == 0 and other.lane == one.lane:
                 merge_(T, p, q)
+                total = np.nan  # odds count from what is chosen
                 break
 
 
@@ -403,9 +411,8 @@ def centre_(T: Any) -> None:  # pragma: no cover - compiled
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def consider_(T: Any, t: float, par: FloatArray) -> None:  # pragma: no cover - compiled
     """After all measurements of a scan at time t [s]: settle, split, give up; in place."""
-    shares_(T, best_global(T), T.error, np.empty((N_PARTIES, 2)))
     for who in range(N_PARTIES):
-        settle_(T, who, t, par[P_SETTLE], T.error)
+        settle_(T, who, t, par[P_SETTLE])
     split_(T)
     drop_globals_(T)
     drop_locals_(T, -1)
