@@ -40,7 +40,8 @@ FOR_NEW = 1400
 """Room for so many courses is left to vehicles that are first seen: for one in any of
 `guides.MOST_LANES` lanes."""
 APART = 0.06
-"""Courses begin so long one after the other [s], and longer where many vehicles are followed."""
+"""Courses begin so long one after the other [s], and longer where many vehicles are followed.  It
+is less than between the scans of a radar at 14 Hz, of which rounding would leave out some."""
 IMPOSSIBLE = 13.5
 """What is less likely than the best by this, as a logarithm, is given up."""
 TRUST = 0.5
@@ -108,8 +109,7 @@ def count_first(places: FloatArray, lane: int) -> int:  # pragma: no cover - com
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def done(T: Any, q: int, who: int, t: float) -> bool:  # pragma: no cover - compiled
     """Whether local hypothesis q is one of a party that has reached its lane at time t."""
-    one = T.local[q]
-    return bool(one.who == who and (one.turn == 0 or t - one.start >= one.duration))
+    return bool(T.local[q].who == who and keeping(T.local[q], t))
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
