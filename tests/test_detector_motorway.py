@@ -446,3 +446,25 @@ def test_a_polar_sensor_and_particles(two_lane: ModeBank) -> None:
     counts = dataclasses.asdict(detector.counts)
     assert counts["outliers"] == counts["numeric_failures"] == counts["invalid"] == 0
     assert said[-1][2]["x"][2] == pytest.approx(3.0, abs=0.2)
+
+
+def test_who_is_far_away_changes_lanes_on_a_road_that_is_known_to_be_straight():
+    """A polar radar, 150 m: half a metre of noise.  A bend that begins there looks the same."""
+
+    def vehicles(t: float) -> dict[int, Vehicle]:
+        done = min(max((t - 8.0) / 3.0, 0.0), 1.0)
+        vy = WIDTH / 3.0 if 8.0 < t < 11.0 else 0.0
+        return {1: (30.0, 0.0, 0.0, 0.0), 2: (150.0, 0.0, WIDTH * done, vy)}
+
+    straight = load_bank("motorway", straight_road=True)
+    found = {}
+    for name, modes in (("learned", bank()), ("straight", straight)):
+        found[name] = 0
+        for seed in range(6):
+            detector = Detector(modes, capacity=8)
+            _, said = play(vehicles, 160, seed=seed, polar=True, detector=detector)
+            found[name] += Manoeuvre.LANE_CHANGE in says(said[80:130], 2)
+            assert says(said[20:80], 2).count(Manoeuvre.LANE_CHANGE) == 0
+            assert Manoeuvre.LANE_CHANGE not in says(said, 1)
+    assert found["straight"] == 6
+    assert found["learned"] < 3

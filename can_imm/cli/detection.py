@@ -67,6 +67,12 @@ def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
         help="where in its lane the ego usually is, to the left; preset motorway",
     )
     parser.add_argument(
+        "--straight-road",
+        action="store_true",
+        help="the road has no bends, as on a proving ground; otherwise it is learned; preset "
+        "motorway",
+    )
+    parser.add_argument(
         "--csv", metavar="OUT", help="write one row per object and scan; - is standard output"
     )
     parser.add_argument(
@@ -142,7 +148,10 @@ class Equipment:
             self._args = args
             self.profile = load_profile(args.profile, sensor=args.sensor)
             self.bank = load_bank(
-                args.preset, lane_width=args.lane_width, lane_offset=args.lane_offset
+                args.preset,
+                lane_width=args.lane_width,
+                lane_offset=args.lane_offset,
+                straight_road=args.straight_road,
             )
             self._files = ExitStack()
             self.csv = self.event_file = None

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 MAX_TUNING_RUNS = 500
+_KINDS = {"full": "", "plain": ", straight road", "published": ", moving as published"}
 
 
 def add_arguments(studies: Any) -> None:
@@ -53,11 +54,7 @@ def add_arguments(studies: Any) -> None:
         default="reporting",
         help="what the traffic is drawn from (default reporting; everything was tuned on tuning)",
     )
-    motorway.add_argument(
-        "--plain",
-        action="store_true",
-        help="a straight road and a constant speed of the ego, nothing but our traffic",
-    )
+    _add_kinds(motorway)
     motorway.add_argument(
         "--systems",
         nargs="+",
@@ -82,11 +79,32 @@ def add_arguments(studies: Any) -> None:
         "check them on seeds 500 to 499+N, and print the constants.",
     )
     tune.add_argument("--profile", default="ars408", metavar="P", help="(default: ars408)")
-    tune.add_argument("--plain", action="store_true", help="on straight roads")
+    _add_kinds(tune)
     tune.add_argument(
         "--runs", type=_tuning_runs, default=25, metavar="N", help="seeds (default 25)"
     )
     tune.set_defaults(study_run=_tune)
+
+
+def _add_kinds(parser: argparse.ArgumentParser) -> None:
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument(
+        "--plain",
+        dest="kind",
+        action="store_const",
+        const="plain",
+        help="a straight road and a constant speed of the ego, nothing but our traffic; detector "
+        "and rules know it",
+    )
+    kinds.add_argument(
+        "--published",
+        dest="kind",
+        action="store_const",
+        const="published",
+        help="the same, and all move as in the published scenario: without wander, across the road "
+        "at a constant rate",
+    )
+    parser.set_defaults(kind="full")
 
 
 def _tuning_runs(text: str) -> int:
@@ -116,19 +134,20 @@ def _motorway(args: argparse.Namespace) -> int:
             systems=list(dict.fromkeys(args.systems or SYSTEMS)),
             preset=args.preset,
             settings=motorway_settings(args.settings),
-            straight=args.plain,
+            kind=args.kind,
             jobs=args.jobs or os.cpu_count() or 1,
             progress=advance,
         )
     data = to_json(args.runs, args.seed, results)
-    data["settings"], data["plain"] = args.settings, args.plain
+    data["settings"] = args.settings
+    data["plain"], data["published"] = args.kind != "full", args.kind == "published"
     if args.json is not None:
         args.json.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", "utf-8")
     console = open_console()
     console.print(
         f"{args.runs} drive{'s' if args.runs > 1 else ''} per profile, seeds {args.seed} to "
         f"{args.seed + args.runs - 1}, settings {args.settings}"
-        f"{', straight road' if args.plain else ''};\nstandard errors with --json\n",
+        f"{_KINDS[args.kind]};\nstandard errors with --json\n",
         highlight=False,
     )
     for title, columns in _TABLES.items():
@@ -197,7 +216,7 @@ def _tune(args: argparse.Namespace) -> int:
         if sys.stderr.isatty():
             print(f"best so far: {best:.4f} wrong frames", file=sys.stderr)
 
-    found = tune(args.profile, args.runs, straight=args.plain, progress=progress)
+    found = tune(args.profile, args.runs, kind=args.kind, progress=progress)
     print(f'"{args.profile}": {found.rules}')
     for what, wrong in (
         ("these rules, seeds tuned on", found.wrong_tuned),

@@ -25,6 +25,8 @@ LARGEST = 1e6
 
 FIXED_STD = 0.02
 """Standard deviation of a lane width or offset that is given [m]."""
+STRAIGHT_STD = 1e-6
+"""That of the curvature of a road that is straight [1/m]."""
 
 _MANOEUVRES = {m.name: m for m in Manoeuvre if m is not Manoeuvre.UNKNOWN}
 _OFF_LANE = (Manoeuvre.STATIONARY, Manoeuvre.ONCOMING)
@@ -74,6 +76,7 @@ def load_bank(
     step_ns: int = 10_000_000,
     lane_width: float | None = None,
     lane_offset: float | None = None,
+    straight_road: bool = False,
 ) -> ModeBank:
     """Load a preset by name, or any TOML file by path.
 
@@ -82,6 +85,7 @@ def load_bank(
         lane_width: of the road, if it is known and not to be learned [m].
         lane_offset: how far to the left of the middle of its lane the ego usually is [m]; for a
             preset with a [road].
+        straight_road: the road is known to be straight; for a preset with a [road].
 
     Raises:
         CanImmError: the file is missing, is not TOML or does not describe a mode bank, or a lane
@@ -102,6 +106,10 @@ def load_bank(
             bank.road[PARAMETERS.index(f"{name}_std")] = FIXED_STD
         elif name == "offset":
             raise top.error("this preset has no [road], and so no offset of the lanes")
+    if straight_road:
+        if bank.road is None:
+            raise top.error("this preset has no [road], and so no bends")
+        bank.road[PARAMETERS.index("curvature_std")] = STRAIGHT_STD
     if lane_offset is not None and not abs(lane_offset) <= 3.0:
         raise CanImmError(f"the lanes' offset must be -3 to 3 m, not {lane_offset:g}")
     return bank

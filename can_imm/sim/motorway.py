@@ -40,12 +40,17 @@ from can_imm.sim.motorway_model import (
     MotorwayScenario,
 )
 from can_imm.sim.motorway_settings import (
+    FULL,
+    KINDS,
+    PLAIN,
+    PUBLISHED,
     REPORTING,
     TUNING,
     VARIANTS,
     MotorwaySettings,
     motorway_settings,
     plain,
+    published,
 )
 from can_imm.sim.road import Road
 from can_imm.sim.traffic import random_motorway
@@ -62,6 +67,10 @@ from can_imm.types import (
 )
 
 __all__ = [
+    "FULL",
+    "KINDS",
+    "PLAIN",
+    "PUBLISHED",
     "REPORTING",
     "TUNING",
     "VARIANTS",
@@ -75,6 +84,7 @@ __all__ = [
     "drive",
     "motorway_settings",
     "plain",
+    "published",
     "random_motorway",
 ]
 

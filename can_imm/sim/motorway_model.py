@@ -24,13 +24,26 @@ Int64Array = npt.NDArray[np.int64]
 class LaneChange:
     """A lateral movement by ``shift`` [m] from ``start`` on [s] in ``time`` [s].
 
-    Its course is ``mix`` times a quintic polynomial plus 1 - ``mix`` times half a cosine wave.
+    Its course is ``mix`` times a quintic polynomial plus 1 - ``mix`` times half a cosine wave, or
+    if it is ``steady`` a straight line.
     """
 
     start: float
     time: float
     shift: float
     mix: float
+    steady: bool = False
+
+    def along(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Share of the way that is done, and its rate [1/s], at shares u of the time."""
+        if self.steady:
+            return u, ((u > 0.0) & (u < 1.0)) / self.time
+        quintic = u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+        cosine = 0.5 - 0.5 * np.cos(np.pi * u)
+        done = self.mix * quintic + (1.0 - self.mix) * cosine
+        quintic = 30.0 * (u * (1.0 - u)) ** 2
+        cosine = 0.5 * np.pi * np.sin(np.pi * u)
+        return done, (self.mix * quintic + (1.0 - self.mix) * cosine) / self.time
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,15 +83,9 @@ class Driver:
         d = self.d + (amplitude * np.sin(angle)).sum(axis=0)
         rate = (amplitude * omega * np.cos(angle)).sum(axis=0)
         for change in self.changes:
-            u = np.clip((t - change.start) / change.time, 0.0, 1.0)
-            quintic = u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
-            cosine = 0.5 - 0.5 * np.cos(np.pi * u)
-            d += change.shift * (change.mix * quintic + (1.0 - change.mix) * cosine)
-            quintic = 30.0 * (u * (1.0 - u)) ** 2
-            cosine = 0.5 * np.pi * np.sin(np.pi * u)
-            rate += (
-                change.shift / change.time * (change.mix * quintic + (1.0 - change.mix) * cosine)
-            )
+            done, pace = change.along(np.clip((t - change.start) / change.time, 0.0, 1.0))
+            d += change.shift * done
+            rate += change.shift * pace
         return d, rate
 
     def changing(self, t: FloatArray) -> Int8Array:

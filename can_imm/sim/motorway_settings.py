@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 from can_imm.types import CanImmError
@@ -28,6 +29,7 @@ class MotorwaySettings:
         faster, slower: greatest speed difference of receding and approaching [m/s].
         acceleration: of the speed ramps, one value per vehicle [m/s²].
         change_time: duration of a lane change [s].
+        steady_changes: lane changes go at a constant rate instead of smoothly.
         change_while_ramping: probability that a companion changes lane within receding/approaching.
         passing: speed difference of those that keep their own speed [m/s], either sign.
         wander: standard deviation of the lateral wander, one value per vehicle [m].
@@ -51,6 +53,7 @@ class MotorwaySettings:
     slower: Range = (1.5, 5.0)
     acceleration: Range = (1.0, 2.6)
     change_time: Range = (3.0, 6.0)
+    steady_changes: bool = False
     change_while_ramping: float = 0.1
     passing: Range = (1.2, 9.0)
     wander: Range = (0.10, 0.30)
@@ -101,6 +104,8 @@ REPORTING = MotorwaySettings(
 )
 """Traffic on which accuracy is reported: nothing is tuned on it."""
 VARIANTS = {"tuning": TUNING, "reporting": REPORTING}
+FULL, PLAIN, PUBLISHED = "full", "plain", "published"
+"""Names of `KINDS`."""
 
 
 def motorway_settings(name: str) -> MotorwaySettings:
@@ -124,3 +129,23 @@ def plain(settings: MotorwaySettings) -> MotorwaySettings:
         oncoming=False,
         roadside=False,
     )
+
+
+def published(settings: MotorwaySettings) -> MotorwaySettings:
+    """The same, and everybody moves as in the published scenario: lanes are kept without wander and
+    changed at a constant rate.  So does the radar: with the noise that is published for it."""
+    return replace(
+        plain(settings),
+        change_time=(2.0, 4.0),
+        steady_changes=True,
+        wander=(0.0, 0.0),
+        noise=1.0,
+    )
+
+
+KINDS: dict[str, Callable[[MotorwaySettings], MotorwaySettings]] = {
+    FULL: lambda settings: settings,
+    PLAIN: plain,
+    PUBLISHED: published,
+}
+"""Kinds of traffic that can be drawn from settings."""

@@ -105,9 +105,11 @@ class Plans:
 
     Args:
         duration: how far the tables reach [s].
+        steady_changes: lane changes go at a constant rate.
     """
 
-    def __init__(self, duration: float) -> None:
+    def __init__(self, duration: float, steady_changes: bool = False) -> None:
+        self.steady_changes = steady_changes
         self.columns = int(duration / DT) + 1
         self.plans: list[Plan] = []
         self.station: FloatArray = np.empty((0, self.columns))
@@ -220,7 +222,8 @@ class Plans:
         plan.rows = [row for row in plan.rows if row[0] < t - 1e-9] + rows
         if move.lane != plan.lane:
             shift = (move.lane - plan.lane) * lane_width
-            plan.changes.append(LaneChange(t + move.at, move.time, shift, plan.mix))
+            start, steady = t + move.at, self.steady_changes
+            plan.changes.append(LaneChange(start, move.time, shift, plan.mix, steady))
             plan.lane = move.lane
         plan.until = t + max(move.duration, 0.5)
         plan.last = move.name

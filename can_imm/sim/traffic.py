@@ -45,7 +45,7 @@ class _Traffic:
         self.dice, self.set = Dice(rng), settings
         self.n_lanes = int(rng.integers(settings.lanes[0], settings.lanes[1] + 1))
         self.lane_width = self.dice.between(settings.lane_width)
-        self.plans = Plans(settings.duration + _HORIZON)
+        self.plans = Plans(settings.duration + _HORIZON, settings.steady_changes)
         self.wishes = Wishes(self.dice, settings, self.plans, self.n_lanes)
         self.ego = self.new_ego()
 

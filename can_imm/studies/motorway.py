@@ -19,7 +19,7 @@ from can_imm.bus.profile import load_profile
 from can_imm.detector import Detector
 from can_imm.manoeuvres import ModeBank
 from can_imm.runtime.loop import STEP_NS
-from can_imm.sim.motorway import REPORTING, MotorwaySettings, plain
+from can_imm.sim.motorway import FULL, KINDS, REPORTING, MotorwaySettings
 from can_imm.sim.radar import radar_model
 from can_imm.smoothing import FixedIntervalSmoother
 from can_imm.studies.metrics import summarise
@@ -108,7 +108,7 @@ class _Collector:
 
 def _scores(
     settings: MotorwaySettings,
-    is_plain: bool,
+    kind: str,
     systems: Sequence[str],
     preset: str,
     job: tuple[str, int],
@@ -118,10 +118,16 @@ def _scores(
     run = play_motorway(profile, seed, settings)
     said: dict[str, Said] = {}
     if any(system != RULES for system in systems):
-        said["motorway"], said["motorway-smoothed"] = detector_says(run, bank(preset), seed)
+        said["motorway"], said["motorway-smoothed"] = detector_says(run, _modes(preset, kind), seed)
     if RULES in systems:
-        said[RULES] = rules_say(run, tuned_rules(profile_name(profile), plain=is_plain))
+        said[RULES] = rules_say(run, tuned_rules(profile_name(profile), kind))
     return [score(run, said[system]) for system in systems]
+
+
+def _modes(preset: str, kind: str) -> ModeBank:
+    """The detector's; the rules for straight roads know that they are, and so does it."""
+    modes = bank(preset)
+    return bank(preset, straight_road=True) if kind != FULL and modes.road is not None else modes
 
 
 def profile_name(profile: str) -> str:
@@ -137,7 +143,7 @@ def study(
     systems: Sequence[str] = SYSTEMS,
     preset: str = "motorway",
     settings: MotorwaySettings = REPORTING,
-    straight: bool = False,
+    kind: str = FULL,
     jobs: int = 1,
     progress: Callable[[], None] = lambda: None,
 ) -> list[Result]:
@@ -150,7 +156,7 @@ def study(
         systems: some of `SYSTEMS`.
         preset: the detector's mode bank, by name or path.
         settings: what the traffic is drawn from.
-        straight: without bends, at a constant speed of the ego; the rules know of it.
+        kind: of traffic, see `sim.motorway.KINDS`.  Where it has no bends, all systems know that.
         jobs: number of processes.
         progress: called after each of the ``runs * len(profiles)`` jobs.
 
@@ -159,8 +165,8 @@ def study(
     """
     for profile in profiles:
         radar_model(profile_name(profile))
-    bank(preset)
-    work = partial(_scores, plain(settings) if straight else settings, straight, systems, preset)
+    _modes(preset, kind)
+    work = partial(_scores, KINDS[kind](settings), kind, systems, preset)
     todo = [(profile, seed + k) for profile in profiles for k in range(runs)]
     results = {(s, p): Result(s, p, []) for p in profiles for s in systems}
     for (profile, _), scores in zip(todo, map_jobs(work, todo, jobs), strict=True):

@@ -1,7 +1,7 @@
 """What the preset motorway has to beat: one Kalman filter per track, and thresholds on its state.
 
 The constants were found by ``can-imm study tune-motorway-rules``, on seeds below 1000, for every
-profile by itself; for straight roads there are others.
+profile by itself; for straight roads there are others, and for traffic that moves as published.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from can_imm.sim.motorway import FULL, PLAIN, PUBLISHED
 from can_imm.studies.runs import Int8Array
 from can_imm.types import VX, VY, BoolArray, FloatArray, IntArray, Manoeuvre, X, Y
 
@@ -140,9 +141,44 @@ PLAIN_RULES: dict[str, Rules] = {
 PLAIN_RULES["toyota-tss2"] = PLAIN_RULES["toyota"]
 
 
-def rules_for(profile: str, *, plain: bool) -> Rules:
-    """The constants for a profile's radar, on straight roads or on all."""
-    return (PLAIN_RULES if plain else RULES).get(profile, START)
+PUBLISHED_RULES: dict[str, Rules] = {
+    "can_imm": Rules(
+        q_along=0.171, q_across=0.742, curvature=0.0, yaw_tau=2.1, common=0.0, width=3.5,
+        lane_vy=0.66, lane_vy_far=0.0485, lane_border=0.6, border_x=50.0, lane_end=0.682,
+        lane_dwell=1, lane_hold=1,
+        receding=0.476, receding_end=0.35, approaching=0.5, approaching_end=0.334, speed_dwell=1,
+        rear_end_x=10.0, stationary=3.0, oncoming=3.0,
+    ),
+    "ars408": Rules(
+        q_along=0.229, q_across=0.458, curvature=0.0, yaw_tau=1.08, common=0.0, width=3.6,
+        lane_vy=0.546, lane_vy_far=0.0543, lane_border=1.15, border_x=243.0, lane_end=1.08,
+        lane_dwell=1, lane_hold=1,
+        receding=0.538, receding_end=0.305, approaching=0.514, approaching_end=0.32, speed_dwell=1,
+        rear_end_x=9.84, stationary=3.0, oncoming=3.0,
+    ),
+    "toyota": Rules(
+        q_along=0.279, q_across=0.363, curvature=0.0, yaw_tau=1.4, common=0.25, width=3.6,
+        lane_vy=0.9, lane_vy_far=0.797, lane_border=0.9, border_x=112.0, lane_end=0.649,
+        lane_dwell=6, lane_hold=1,
+        receding=0.333, receding_end=0.156, approaching=0.303, approaching_end=0.156, speed_dwell=1,
+        rear_end_x=10.0, stationary=3.0, oncoming=3.0,
+    ),
+    "esr": Rules(
+        q_along=0.353, q_across=0.806, curvature=0.0, yaw_tau=2.63, common=0.0, width=3.6,
+        lane_vy=0.622, lane_vy_far=0.304, lane_border=0.936, border_x=266.0, lane_end=1.04,
+        lane_dwell=2, lane_hold=1,
+        receding=0.372, receding_end=0.17, approaching=0.442, approaching_end=0.143, speed_dwell=1,
+        rear_end_x=9.97, stationary=3.0, oncoming=3.0,
+    ),
+}  # fmt: skip
+"""By profile, for traffic that moves as in the published scenario."""
+PUBLISHED_RULES["toyota-tss2"] = PUBLISHED_RULES["toyota"]
+_BY_KIND = {FULL: RULES, PLAIN: PLAIN_RULES, PUBLISHED: PUBLISHED_RULES}
+
+
+def rules_for(profile: str, kind: str) -> Rules:
+    """The constants for a profile's radar and a kind of traffic (`sim.motorway.KINDS`)."""
+    return _BY_KIND[kind].get(profile, START)
 
 
 _KEEP, _CHANGE = int(Manoeuvre.KEEP_LANE), int(Manoeuvre.LANE_CHANGE)

@@ -1,6 +1,6 @@
 """How the constants of `motorway_rules` were found: ``can-imm study tune-motorway-rules``.
 
-For every profile by itself, on all roads and on straight ones, on traffic with the settings
+For every profile and every kind of traffic by itself, on traffic with the settings
 "tuning" and seeds below `runs.FIRST_SEED`.  What is minimised is the share of wrong frames among
 those of `TRAFFIC`, averaged over runs: one constant at a time, coarse steps first, from several
 starts.
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from can_imm.sim.motorway import TUNING, MotorwaySettings, plain
+from can_imm.sim.motorway import FULL, KINDS, TUNING, MotorwaySettings
 from can_imm.studies.descent import descend
 from can_imm.studies.motorway_filter import Frames, curvature_of, follow, frames_of, level
 from can_imm.studies.motorway_rules import START, Rules, judge, rules_for
@@ -113,7 +113,7 @@ def tune(
     profile: str,
     runs: int,
     *,
-    straight: bool = False,
+    kind: str = FULL,
     starts: int = _STARTS,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Tuning:
@@ -122,17 +122,17 @@ def tune(
     Args:
         profile: name of a profile whose radar is simulated.
         runs: number of seeds, up to `FIRST_SEED` / 2.
-        straight: on straight roads, with a constant speed of the ego.
+        kind: of traffic, see `sim.motorway.KINDS`.
         starts: number of starting points.
         progress: called with the best share so far.
     """
-    settings = plain(TUNING) if straight else TUNING
+    settings = KINDS[kind](TUNING)
     half = FIRST_SEED // 2
     objective = Objective(collect(profile, range(runs), settings))
     check = Objective(collect(profile, range(half, half + runs), settings))
     rng = np.random.default_rng(0)
     best, found = np.inf, START
-    in_use = rules_for(profile, plain=straight)
+    in_use = rules_for(profile, kind)
     for start in range(starts):
         begin = in_use if start == 0 else _scattered(START, rng)
         error, rules = descend(

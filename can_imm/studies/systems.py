@@ -51,9 +51,9 @@ def answer(
 
 
 @lru_cache
-def bank(name: str) -> ModeBank:
-    """The mode bank of that name or path, read once per process."""
-    return load_bank(name)
+def bank(name: str, *, straight_road: bool = False) -> ModeBank:
+    """The mode bank of that name or path, read once per process; see `load_bank`."""
+    return load_bank(name, straight_road=straight_road)
 
 
 def _baseline(system: str, seen: Observation) -> Answer:

@@ -346,6 +346,15 @@ def test_the_summary_says_what_was_heard_of_the_ego_motion(can_imm, tmp_path, sp
     assert "rejected   0\n" in out
 
 
+def test_a_straight_road_is_one_of_the_preset_motorway(can_imm, log):
+    status, out, err = can_imm("replay", log, "--straight-road")
+    assert (status, out) == (1, "")
+    assert err.count("\n") == 1
+    assert "two-lane" in err
+    assert "no [road]" in err
+    assert can_imm("replay", log, "--straight-road", "--preset", "motorway")[0] == 0
+
+
 def test_lagged_frames_come_late_and_say_what_the_csv_says(can_imm, log, tmp_path):
     """Each scan's a second after the scan, those of the last second in the last step."""
     out, table = tmp_path / "out.log", tmp_path / "said.csv"

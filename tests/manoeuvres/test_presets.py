@@ -217,6 +217,16 @@ def test_lanes_that_are_known() -> None:
     assert load_bank("two-lane", lane_width=3.2).record[0]["lane_prior"] == 0.0
 
 
+def test_a_road_that_is_known_to_be_straight() -> None:
+    bank, usual = load_bank("motorway", straight_road=True), load_bank("motorway")
+    assert bank.road is not None
+    assert usual.road is not None
+    changed = np.array(PARAMETERS)[bank.road != usual.road]
+    assert changed.tolist() == ["curvature_std"]
+    # over 250 m it leaves its tangent by less than what a radar sees
+    assert 0.0 < bank.road[PARAMETERS.index("curvature_std")] * 250.0**2 / 2.0 < 0.05
+
+
 @pytest.mark.parametrize(
     ("name", "lanes", "message"),
     [
@@ -225,9 +235,10 @@ def test_lanes_that_are_known() -> None:
         ("motorway", {"lane_offset": 3.1}, "offset must be -3 to 3 m, not 3.1"),
         ("motorway", {"lane_offset": math.nan}, "offset must be"),
         ("two-lane", {"lane_offset": 0.1}, r"two-lane.*: this preset has no \[road\]"),
+        ("two-lane", {"straight_road": True}, r"two-lane.*: this preset has no \[road\]"),
     ],
 )
-def test_lanes_that_are_none(name: str, lanes: dict[str, float], message: str) -> None:
+def test_lanes_that_are_none(name: str, lanes: dict[str, Any], message: str) -> None:
     with pytest.raises(CanImmError, match=message):
         load_bank(name, **lanes)
 

@@ -21,6 +21,7 @@ from can_imm.sim.motorway import (
     drive,
     motorway_settings,
     plain,
+    published,
     random_motorway,
 )
 from can_imm.sim.road import Road, random_road, straight
@@ -162,6 +163,16 @@ def test_a_lane_change_takes_its_time_and_one_lane(mix: float) -> None:
     assert not truth.flags[:400].any()
     assert not truth.flags[700:].any()
     assert truth.lane[549:552].tolist() in ([0, 0, 1], [0, 1, 1])
+
+
+def test_a_steady_lane_change_is_a_straight_line() -> None:
+    change = LaneChange(4.0, 3.0, -W, 0.4, steady=True)
+    (truth,) = drive(scenario(driver((0.0, 40.0, 25.0, 0.0), d=W, changes=(change,)))).objects
+    t = truth.t_ns * 1e-9
+    np.testing.assert_allclose(truth.state[:, 2], np.interp(t, [4.0, 7.0], [W, 0.0]), atol=1e-9)
+    during = (t > 4.001) & (t < 6.999)
+    np.testing.assert_allclose(truth.state[:, 3], np.where(during, -W / 3.0, 0.0), atol=1e-9)
+    assert set(truth.direction[during]) == {-1}
 
 
 def test_a_change_into_the_egos_lane_is_a_cut_in() -> None:
@@ -435,6 +446,27 @@ def test_switches() -> None:
         speed = np.diff(truth.ego.station)[0] / 0.01
         np.testing.assert_allclose(truth.ego.speed, speed, rtol=1e-3)
         assert len(truth.objects) == len(traffic(truth))
+
+
+def test_as_published_everybody_keeps_to_the_middle_or_crosses_at_a_constant_rate() -> None:
+    settings = published(REPORTING)
+    assert settings.noise == 1.0
+    changes = 0
+    for seed in range(5):
+        truth = drive(random_motorway(np.random.default_rng(seed), settings))
+        width = truth.scenario.lane_width
+        for one in truth.objects:
+            lane, vy = one.d / width, one.state[:, 3]
+            keeping = one.direction == 0
+            np.testing.assert_allclose(lane[keeping], np.round(lane[keeping]), atol=1e-6)
+            for begin in np.flatnonzero(np.diff(one.direction) != 0)[:-1] + 1:
+                rates = np.abs(vy[begin : begin + 199])[1:-1]
+                if keeping[begin] or len(rates) < 197:
+                    continue
+                changes += 1
+                np.testing.assert_allclose(rates, rates[0], atol=1e-6)
+                assert width / 4.0 <= rates[0] <= width / 2.0
+    assert changes > 20
 
 
 def test_the_ego_keeps_to_its_ranges(drives: list[MotorwayTruth]) -> None:

@@ -11,7 +11,7 @@ import pytest
 from can_imm.bus.profile import load_profile
 from can_imm.cli.main import build_parser, main
 from can_imm.manoeuvres import load_bank
-from can_imm.sim.motorway import REPORTING, TUNING, VARIANTS, plain
+from can_imm.sim.motorway import PLAIN, PUBLISHED, REPORTING, TUNING, VARIANTS, plain, published
 from can_imm.sim.radar import RADARS
 from can_imm.studies import motorway_tuning
 from can_imm.studies.motorway import (
@@ -22,7 +22,7 @@ from can_imm.studies.motorway import (
     to_json,
 )
 from can_imm.studies.motorway_metrics import score
-from can_imm.studies.motorway_rules import PLAIN_RULES, RULES, START, rules_for
+from can_imm.studies.motorway_rules import PLAIN_RULES, PUBLISHED_RULES, RULES, START, rules_for
 from can_imm.studies.motorway_runs import TRAFFIC, play_motorway
 from can_imm.studies.paper import study as paper_study
 from can_imm.studies.paper import to_json as paper_json
@@ -163,13 +163,17 @@ def test_every_frame_gets_a_report_and_those_without_one_are_wrong():
     assert after.accuracy == pytest.approx(before.accuracy - 10 / np.count_nonzero(of))
 
 
-def test_straight_roads_have_rules_of_their_own(monkeypatch):
-    monkeypatch.setitem(PLAIN_RULES, "can_imm", START._replace(receding=100.0))
-    results = study(1, 904, profiles=["can_imm"], systems=["rules"], settings=SHORT, straight=True)
+@pytest.mark.parametrize(
+    ("kind", "drawn", "rules"),
+    [(PLAIN, plain, PLAIN_RULES), (PUBLISHED, published, PUBLISHED_RULES)],
+)
+def test_each_kind_of_traffic_has_rules_of_its_own(kind, drawn, rules, monkeypatch):
+    monkeypatch.setitem(rules, "can_imm", START._replace(receding=100.0))
+    results = study(1, 904, profiles=["can_imm"], systems=["rules"], settings=SHORT, kind=kind)
     confusion = results[0].scores[0].metrics.confusion
     assert confusion[:, Manoeuvre.RECEDING].sum() == 0
-    run = play_motorway("can_imm", 904, plain(SHORT))
-    said = rules_say(run, rules_for("can_imm", plain=True))
+    run = play_motorway("can_imm", 904, drawn(SHORT))
+    said = rules_say(run, rules_for("can_imm", kind))
     of = np.isin(run.label, TRAFFIC)
     assert results[0].scores[0].metrics.accuracy == pytest.approx(
         np.mean(said.manoeuvre[of] == run.label[of])
@@ -178,7 +182,7 @@ def test_straight_roads_have_rules_of_their_own(monkeypatch):
 
 
 def test_there_are_rules_for_every_radar():
-    assert set(RULES) == set(PLAIN_RULES) == set(RADARS)
+    assert set(RULES) == set(PLAIN_RULES) == set(PUBLISHED_RULES) == set(RADARS)
     for name in RADARS:
         assert load_profile(name).name == name
 
@@ -229,7 +233,7 @@ def test_command_prints_tables_and_writes_json(tmp_path, capsys, monkeypatch):
     assert "…" not in out
     assert "oncoming" not in out
     data = json.loads(file.read_text())
-    assert (data["settings"], data["plain"]) == ("reporting", True)
+    assert (data["settings"], data["plain"], data["published"]) == ("reporting", True, False)
     found = {(r["profile"], r["system"]): r for r in data["results"]}
     assert set(found) == {(p, s) for p in profiles[1::2] for s in SYSTEMS}
     rows = [line.split() for line in out.splitlines()]
@@ -243,8 +247,8 @@ def test_command_prints_tables_and_writes_json(tmp_path, capsys, monkeypatch):
 def test_tune_command_prints_constants_as_code(monkeypatch, capsys):
     asked = []
 
-    def tune(profile, runs, *, straight, progress):
-        asked.append((profile, runs, straight))
+    def tune(profile, runs, *, kind, progress):
+        asked.append((profile, runs, kind))
         progress(0.5)
         return motorway_tuning.Tuning(START, 0.1, 0.2, 0.3)
 
@@ -252,7 +256,7 @@ def test_tune_command_prints_constants_as_code(monkeypatch, capsys):
     command = ["study", "tune-motorway-rules", "--profile", "esr", "--runs", "3", "--plain"]
     assert main(command) == 0
     out, err = capsys.readouterr()
-    assert asked == [("esr", 3, True)]
+    assert asked == [("esr", 3, "plain")]
     assert err == ""
     assert f'"esr": {START}' in out
 
