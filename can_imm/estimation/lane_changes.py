@@ -6,7 +6,9 @@ course.  Beside the course it wanders, and what is thought of the road is not qu
 together are a Gaussian process with the Matern covariance of order 3/2 (state: place beside the
 course and its rate), known through a Kalman filter.  All courses have the same covariance in it,
 only the means differ, so that many courses can be followed at little cost.  Some time after a
-course ended in a lane, it is merged with the others that are in that lane by then.
+course ended in a lane, it is merged with the others that are in that lane by then.  Who does not
+wait so long until the next lane change is in the lane *in passing*: a state of its own, which
+courses lead to as soon as they end.
 """
 
 from __future__ import annotations
@@ -44,9 +46,13 @@ OUTLIER = 16.0
 SETTLE = 1.0
 """So long after its end [s] a course is still followed on its own: whether it ended too early shows
 only then."""
+AGAIN, AGAIN_TIME = 0.05, 0.5
+"""Share of the lane changes that are followed by another one at once, and how soon [s]."""
 EDGE = 12
 """Lanes are numbered from -EDGE to EDGE."""
 N_LANES = 2 * EDGE + 1
+N_STATES = 2 * N_LANES
+"""States a vehicle may be in: in a lane, and from `N_LANES` on in a lane in passing."""
 N_BEGUN = 8
 """Courses that had begun before the first measurement are tried from so many beginnings."""
 UNKNOWN = 1e6
@@ -63,11 +69,13 @@ COURSE_DTYPE = np.dtype(
         ("start", np.float64),
         ("duration", np.float64),
         ("lane", np.int64),
+        ("passing", np.bool_),
         ("turn", np.int64),
         ("steady", np.bool_),
         ("log_prior", np.float64),
         ("log_before", np.float64),
         ("log_like", np.float64),
+        ("log_end", np.float64),
         ("place", np.float64),
         ("rate", np.float64),
     ],
@@ -75,10 +83,10 @@ COURSE_DTYPE = np.dtype(
 )
 """A lane change that may have been: rows ``first`` to ``end`` - 1 lie in it, from ``merged`` on it
 is one with its new lane; it began at ``start`` and lasted ``duration`` [s], from ``lane`` (0 to
-`N_LANES` - 1) to that + ``turn``, at a constant rate if ``steady``.  Logarithms of its prior
-probability where it begins, of the weight of what led there, and of the likelihood of what was
-measured during it (backwards: from its beginning to the track's end).  ``place``, ``rate`` beside
-the course [m, m/s]."""
+`N_LANES` - 1), where it was in ``passing``, to that + ``turn``, at a constant rate if ``steady``.
+Logarithms of its prior probability where it begins, of the weight of what led there, and of the
+likelihood of what was measured during it (backwards: from its beginning to the track's end) and
+before its end.  ``place``, ``rate`` beside the course [m, m/s]."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
@@ -211,16 +219,23 @@ def begin_(
     end: int,
     start: float,
     duration: float,
-    lane: int,
+    state: int,
     turn: int,
     steady: bool,
 ) -> None:  # pragma: no cover - compiled
     """Where and when a course runs; the rest is 0."""
     course.first, course.end, course.merged = first, end, end
     course.start, course.duration = start, duration
-    course.lane, course.turn, course.steady = lane, turn, steady
-    course.log_prior = course.log_before = course.log_like = 0.0
+    course.lane, course.passing = state % N_LANES, state >= N_LANES
+    course.turn, course.steady = turn, steady
+    course.log_prior = course.log_before = course.log_like = course.log_end = 0.0
     course.place = course.rate = 0.0
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def leaves(state: int, dt: float) -> float:  # pragma: no cover - compiled
+    """Probability that a lane change begins within ``dt`` [s]."""
+    return 1.0 - math.exp(-dt / AGAIN_TIME) if state >= N_LANES else min(RATE * dt, 0.5)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -245,12 +260,13 @@ def find_lane_changes_(
         p: (K, 2) written: changing to the left, to the right.
     """
     n = len(t)
-    # logarithms: weight of being in a lane by what was measured until then, likelihood of the
-    # measurement there, likelihood of all that was measured afterwards
-    alpha = np.zeros((n, N_LANES))
-    like = np.zeros((n, N_LANES))
-    beta = np.zeros((n, N_LANES))
-    place, rate = np.zeros(N_LANES), np.zeros(N_LANES)
+    # logarithms: weight of a state by what was measured until then, likelihood of the measurement
+    # there, likelihood of all that was measured afterwards
+    alpha = np.zeros((n, N_STATES))
+    like = np.zeros((n, N_STATES))
+    beta = np.zeros((n, N_STATES))
+    place, rate = np.zeros(N_STATES), np.zeros(N_STATES)
+    alpha[0, N_LANES:] = -np.inf
     courses = np.zeros(4096, COURSE_DTYPE)
     active = np.zeros(4096, np.int64)
     count = n_active = 0
@@ -260,8 +276,9 @@ def find_lane_changes_(
     for k in range(n):
         # what may begin
         dt = t[k] - t[max(k - 1, 0)]
-        for lane in range(1, N_LANES - 1):
-            if k > 0 and alpha[k - 1, lane] < best - IMPOSSIBLE:
+        for state in range(N_STATES):
+            lane = state % N_LANES
+            if lane in (0, N_LANES - 1) or alpha[max(k - 1, 0), state] < best - IMPOSSIBLE:
                 continue
             for turn in (-1, 1):
                 # at first only what passes the place where the vehicle is
@@ -277,16 +294,16 @@ def find_lane_changes_(
                             courses = grown(courses)
                             active = np.concatenate((active, np.zeros_like(active)))
                         start = t[k] - 0.5 * dt
-                        span = dt
+                        begins = leaves(state, dt)
                         if k == 0:
                             start = t[0] - (b + 0.5) / N_BEGUN * lasts
-                            span = lasts / N_BEGUN
+                            begins = RATE * lasts / N_BEGUN
                         c = courses[count]
-                        begin_(c, k, n, start, lasts, lane, turn, steady)
-                        c.log_prior = math.log(0.5 * RATE * span) + LOG_P[i] + share
+                        begin_(c, k, n, start, lasts, state, turn, steady)
+                        c.log_prior = math.log(0.5 * begins) + LOG_P[i] + share
                         if k > 0:
-                            c.log_before = alpha[k - 1, lane]
-                            c.place, c.rate = place[lane], rate[lane]
+                            c.log_before = alpha[k - 1, state]
+                            c.place, c.rate = place[state], rate[state]
                         active[n_active] = count
                         n_active += 1
                         count += 1
@@ -294,41 +311,36 @@ def find_lane_changes_(
         if k > 0:
             f = fading(HURRY, dt)
             P = spread(P, f, HURRY, beside[k])
-            for lane in range(N_LANES):
-                alpha[k, lane] = alpha[k - 1, lane] + math.log1p(-min(RATE * dt, 0.5))
-                place[lane], rate[lane] = carried(place[lane], rate[lane], f)
+            for state in range(N_STATES):
+                alpha[k, state] = alpha[k - 1, state] + math.log1p(-leaves(state, dt))
+                place[state], rate[state] = carried(place[state], rate[state], f)
         kept = 0
         for q in range(n_active):
             c = courses[active[q]]
             c.place, c.rate = carried(c.place, c.rate, f)
             since = t[k] - c.start - c.duration
             if since >= 0.0 and c.end == n:
-                c.end = k
+                c.end, c.log_end = k, c.log_like
+                merge_(c, math.log(AGAIN), N_LANES, alpha[k], place, rate)
             if since < SETTLE:
                 active[kept] = active[q]
                 kept += 1
                 continue
             c.merged = k
-            to = c.lane + c.turn
-            log_w = c.log_before + c.log_prior + c.log_like
-            total = add_logs(alpha[k, to], log_w)
-            w = math.exp(log_w - total)
-            place[to] += w * (c.place - place[to])
-            rate[to] += w * (c.rate - rate[to])
-            alpha[k, to] = total
+            merge_(c, 0.0, 0, alpha[k], place, rate)
         n_active = kept
         # the measurement
         P, of_place, of_speed = gains(P, r[k], rv[k])
         scale = -0.5 * (math.log(of_place[0]) + math.log(of_speed[0]))
         best = -np.inf
-        for lane in range(N_LANES):
-            off = y[k] - (lane - EDGE) * width
-            place[lane], rate[lane], lost = correct(
-                place[lane], rate[lane], off, vy[k], of_place, of_speed, OUTLIER
+        for state in range(N_STATES):
+            off = y[k] - (state % N_LANES - EDGE) * width
+            place[state], rate[state], lost = correct(
+                place[state], rate[state], off, vy[k], of_place, of_speed, OUTLIER
             )
-            like[k, lane] = scale - 0.5 * lost
-            alpha[k, lane] += like[k, lane]
-            best = max(best, alpha[k, lane])
+            like[k, state] = scale - 0.5 * lost
+            alpha[k, state] += like[k, state]
+            best = max(best, alpha[k, state])
         for q in range(n_active):
             c = courses[active[q]]
             done, slope = course((t[k] - c.start) / c.duration, c.steady)
@@ -351,6 +363,25 @@ def find_lane_changes_(
     look_back_(t, alpha, like, beta, courses, count, p)
 
 
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def merge_(
+    course: Any, share: float, passing: int, alpha: FloatArray, place: FloatArray, rate: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """Let a course, or a share of it (its logarithm), be one with the lane it leads to.
+
+    Args:
+        passing: `N_LANES` if it is there in passing, else 0.
+        alpha, place, rate: (N_STATES,) in place.
+    """
+    to = passing + course.lane + course.turn
+    log_w = course.log_before + course.log_prior + course.log_like + share
+    total = add_logs(alpha[to], log_w)
+    w = math.exp(log_w - total)
+    place[to] += w * (course.place - place[to])
+    rate[to] += w * (course.rate - rate[to])
+    alpha[to] = total
+
+
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def look_back_(
     t: FloatArray,
@@ -369,13 +400,14 @@ def look_back_(
         # courses are in the order of their first rows
         k = n - 1 - q
         if k < n - 1:
-            stay = math.log1p(-min(RATE * (t[k + 1] - t[k]), 0.5))
-            for lane in range(N_LANES):
-                beta[k, lane] = stay + like[k + 1, lane] + beta[k + 1, lane]
+            for state in range(N_STATES):
+                stay = math.log1p(-leaves(state, t[k + 1] - t[k]))
+                beta[k, state] = stay + like[k + 1, state] + beta[k + 1, state]
         while c >= 0 and courses[c].first > k:
-            lane = courses[c].lane
-            add_rest_(courses[c], n, like, beta)
-            beta[k, lane] = add_logs(beta[k, lane], courses[c].log_prior + courses[c].log_like)
+            one = courses[c]
+            add_rest_(one, n, like, beta)
+            at = one.lane + (N_LANES if one.passing else 0)
+            beta[k, at] = add_logs(beta[k, at], one.log_prior + one.log_like)
             c -= 1
     for lane in range(N_LANES):
         total = add_logs(total, alpha[0, lane] + beta[0, lane])
@@ -397,7 +429,12 @@ def look_back_(
 def add_rest_(
     course: Any, n: int, like: FloatArray, beta: FloatArray
 ) -> None:  # pragma: no cover - compiled
-    """Add what was measured after a course became one with its lane."""
+    """Add what was measured after a course became one with its lane, and what if that was in
+    passing."""
+    to = course.lane + course.turn
     if course.merged < n:
-        to = course.lane + course.turn
         course.log_like += like[course.merged, to] + beta[course.merged, to]
+    if course.end < n:
+        to += N_LANES
+        rest = math.log(AGAIN) + like[course.end, to] + beta[course.end, to]
+        course.log_like = add_logs(course.log_like, course.log_end + rest)

@@ -126,6 +126,30 @@ def test_it_is_what_all_hypotheses_say(
         assert p[middle, 0 if side > 0 else 1] > 0.9
 
 
+@pytest.mark.parametrize("second", [1, -1])
+@pytest.mark.parametrize("pause", [0.0, 0.3, 0.8, 2.0])
+def test_another_one_right_after_the_first(pause: float, second: int) -> None:
+    """On to the lane after next, or back again."""
+    rng = np.random.default_rng(3)
+    t = np.arange(210) / 14.0
+    right: list[float] = []
+    for _ in range(8):
+        begin, lasts = rng.uniform(3.0, 4.0), rng.uniform(3.0, 4.0, 2)
+        again = begin + lasts[0] + pause
+        y, vy = drive(rng, t, 0, 1, begin, lasts[0])
+        u = (t - again) / lasts[1]
+        y = y + second * WIDTH * way(u)
+        vy = vy + second * WIDTH * (way(u + 1e-6) - way(u - 1e-6)) / (2e-6 * lasts[1])
+        p = found(t, y, vy)
+        first = (t >= begin) & (t < begin + lasts[0])
+        then = (t >= again) & (t < again + lasts[1])
+        side = 0 if second > 0 else 1
+        said = np.where((p > 0.5).any(axis=1), p.argmax(axis=1), -1)
+        right.append(float(np.mean(said == np.where(first, 0, np.where(then, side, -1)))))
+    assert np.mean(right) > 0.94
+    assert min(right) > 0.88
+
+
 def test_onset_and_end_to_a_fifth_of_a_second() -> None:
     """Many changes at 14 Hz: where the probability passes one half, and how often that is right."""
     rng = np.random.default_rng(2)
