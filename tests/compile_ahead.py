@@ -1,7 +1,7 @@
 """Fill numba's cache: ``python tests/compile_ahead.py``.
 
-Compiling holds the interpreter, so another process does it while the first tests run.  They begin
-with the filters of single objects; this begins with the road.
+Compiling holds the interpreter, so another process does it while the first tests run, those that
+need nothing of what is compiled here (see `conftest`).
 """
 
 from __future__ import annotations

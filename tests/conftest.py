@@ -42,16 +42,40 @@ settings.register_profile("can_imm", deadline=None, derandomize=True)
 settings.load_profile("can_imm")
 
 _ahead: list[subprocess.Popen[bytes]] = []
+_WITHOUT_THE_DETECTOR = (
+    "bus/",
+    "manoeuvres/",
+    "plots/",
+    "sim/",
+    "trackers/",
+    "estimation/test_bernoulli",
+    "estimation/test_ukf",
+    "studies/test_bernoulli",
+    "studies/test_roadside",
+    "studies/test_motorway_rules",
+    "studies/test_motorway_metrics",
+    "studies/test_tuning",
+)
+"""Tests whose kernels `compile_ahead` does not compile."""
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Where nothing is compiled yet, let another process do half of it."""
+    """Where nothing is compiled yet, let another process do most of it."""
     if not any(_package.glob("estimation/__pycache__/*.nbc")) and (os.cpu_count() or 1) > 1:
         script = Path(__file__).with_name("compile_ahead.py")
         _ahead.append(
             subprocess.Popen(
                 [sys.executable, script], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
             )
+        )
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """While the other process compiles, test what needs nothing of that."""
+    if _ahead:
+        here = Path(__file__).parent
+        items.sort(
+            key=lambda item: not str(item.path.relative_to(here)).startswith(_WITHOUT_THE_DETECTOR)
         )
 
 
