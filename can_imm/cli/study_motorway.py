@@ -174,6 +174,7 @@ _TABLES: dict[str, _Columns] = {
     "Lane changes": {
         "lane\nchanges": ("lane_changes", 0, None),
         "found": ("lane_changes_found", 3, None),
+        "within\n100 m": ("lane_changes_found_nearby", 3, None),
         "delay\n[s]": ("lane_change_delay_s", 2, None),
         "false\nper hour": ("false_lane_changes_per_hour", 1, None),
         "object\nhours": ("object_hours", 2, None),

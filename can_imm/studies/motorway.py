@@ -218,6 +218,7 @@ def _quotients(scores: Sequence[Score], rules: Result | None) -> dict[str, tuple
                 [getattr(s, attribute)[1] for s in scores],
             )
             for name, attribute in (
+                ("lane_changes_found_nearby", "nearby"),
                 ("lane_accuracy", "lanes"),
                 ("stationary_share", "stationary"),
                 ("oncoming_share", "oncoming"),

@@ -11,12 +11,14 @@ from can_imm.sim.motorway import DT_NS, ObjectTruth
 from can_imm.studies.metrics import Metrics, evaluate
 from can_imm.studies.motorway_runs import TRAFFIC, MotorwayRun
 from can_imm.studies.runs import Int8Array, Int64Array
-from can_imm.types import BoolArray, FloatArray, Manoeuvre
+from can_imm.types import BoolArray, FloatArray, Manoeuvre, X
 
 SEEN_NS = 2_000_000_000
 """A lane change counts if a track saw so much of it [ns]."""
 NEAR_NS = 1_000_000_000
 """What is said of a lane change so long before or after it is not false [ns]."""
+NEARBY = 100.0
+"""Lane changes that begin within this distance along x [m] are counted by themselves, too."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class Score:
             second tracks.
         changes: number of lane changes.
         found: of them, those that were said.
+        nearby: those found, and all, that begin within `NEARBY`.
         delays_s: from the beginning to the first of two right frames, where it was seen [s].
         false: stretches said to be a lane change where there is none.
         hours: that all tracks were seen [h].
@@ -55,6 +58,7 @@ class Score:
     metrics: Metrics
     changes: int
     found: int
+    nearby: tuple[int, int]
     delays_s: tuple[float, ...]
     false: int
     hours: float
@@ -81,6 +85,7 @@ def score(run: MotorwayRun, said: Said) -> Score | None:
         metrics=_metrics(run, said, [track for track in run.tracks if traffic[track[0]]]),
         changes=found.changes,
         found=found.found,
+        nearby=(found.found_nearby, found.nearby),
         delays_s=tuple(found.delays_s),
         false=found.false,
         hours=found.hours,
@@ -120,6 +125,7 @@ class _Events:
 
     def __init__(self) -> None:
         self.changes = self.found = self.false = 0
+        self.nearby = self.found_nearby = 0
         self.delays_s: list[float] = []
         self.hours = 0.0
 
@@ -131,11 +137,14 @@ class _Events:
         for begin, end in _stretches(true):
             if t_ns[end - 1] - t_ns[begin] < SEEN_NS:
                 continue
+            is_nearby = bool(run.state[track[begin], X] <= NEARBY)
             self.changes += 1
+            self.nearby += is_nearby
             right = changing[begin:end] & (direction[begin:end] == true[begin])
             pairs = np.flatnonzero(right[:-1] & right[1:])
             if len(pairs):
                 self.found += 1
+                self.found_nearby += is_nearby
                 if begin > 0:
                     self.delays_s.append(float(t_ns[begin + pairs[0]] - t_ns[begin]) * 1e-9)
         target = run.truth.objects[int(run.object[track[0]])]

@@ -12,7 +12,7 @@ import pytest
 from can_imm.sim.motorway import DT_NS, ObjectTruth
 from can_imm.studies.motorway_metrics import Said, ratio, score
 from can_imm.studies.motorway_runs import MotorwayRun
-from can_imm.types import Manoeuvre
+from can_imm.types import Manoeuvre, X
 
 KEEP, CHANGE, RECEDING = Manoeuvre.KEEP_LANE, Manoeuvre.LANE_CHANGE, Manoeuvre.RECEDING
 STATIONARY, ONCOMING = Manoeuvre.STATIONARY, Manoeuvre.ONCOMING
@@ -155,6 +155,17 @@ def test_a_lane_change_is_found_by_two_frames_in_the_right_direction():
     assert found([29, 30]) == (0, ())
     assert found([69, 70]) == (0, ())
     assert found([35, 68, 69]) == (1, (3.8,))
+
+
+def test_lane_changes_nearby_are_counted_by_themselves():
+    """Where they are when they begin counts."""
+    run = drive_of(CHANGING, CHANGING, CHANGING)
+    run.state[:, X] = np.repeat([99.0, 101.0, 40.0], 100)
+    run.state[35:60, X] = 120.0
+    manoeuvre, direction = run.label.copy(), run.direction.copy()
+    manoeuvre[200:] = KEEP
+    done = score(run, say(run, manoeuvre=manoeuvre, direction=direction))
+    assert (done.changes, done.found, done.nearby) == (3, 2, (1, 2))
 
 
 def test_lane_changes_seen_in_part():

@@ -32,6 +32,7 @@ from can_imm.types import CanImmError, Manoeuvre
 SHORT = replace(TUNING, duration=20.0)
 QUOTIENTS = {
     "lane_changes_found",
+    "lane_changes_found_nearby",
     "false_lane_changes_per_hour",
     "lane_change_delay_s",
     "lane_accuracy",
