@@ -68,8 +68,41 @@ def rear_end_share(gap: float, width: float, x: float, y: float, cov: FloatArray
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def withhold_(
+    bank: Any, mu: FloatArray, vx: float, variance: float, reached: FloatArray, p: FloatArray
+) -> None:
+    """Who holds a speed that never reached the bank's peak keeps its lane instead; in place.
+
+    How far that is held against it depends on how sure it is that the speed is held.
+
+    Args:
+        mu: (M,).  vx, variance: relative speed [m/s].  reached: as in `layout.OBJECT_DTYPE`.
+        p: (12,) of the manoeuvres, sums over modes.
+    """
+    for side in range(2):
+        manoeuvre = _RECEDING if side == 0 else _APPROACHING
+        held = 0.0
+        for j in range(bank.n_modes):
+            if bank.is_steady[j] and bank.manoeuvre[j] == manoeuvre:
+                held += mu[j]
+        if held <= 0.0:
+            continue
+        speed = vx if side == 0 else -vx
+        slow = 0.5 * math.erfc((speed - bank.peak_speed) / math.sqrt(2.0 * variance))
+        share = held * held / p[manoeuvre] * slow * (1.0 - reached[side])
+        p[manoeuvre] -= share
+        p[_KEEP_LANE] += share
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def conclude_(
-    bank: Any, width: float, mu: FloatArray, mean: FloatArray, cov: FloatArray, report: Any
+    bank: Any,
+    width: float,
+    mu: FloatArray,
+    mean: FloatArray,
+    cov: FloatArray,
+    reached: FloatArray,
+    report: Any,
 ) -> None:
     """Fill one report from mode probabilities and the combined estimate.
 
@@ -80,7 +113,7 @@ def conclude_(
 
     Args:
         bank: record of `layout.BANK_DTYPE`.  width: of the object's lanes [m].
-        mu: (M,).  mean: (n,).  cov: (n, n).
+        mu: (M,).  mean: (n,).  cov: (n, n).  reached: (2,) as in `layout.OBJECT_DTYPE`.
     """
     for i in range(report.p.shape[0]):
         report.p[i] = 0.0
@@ -88,6 +121,8 @@ def conclude_(
     for j in range(bank.n_modes):
         report.p[bank.manoeuvre[j]] += mu[j]
         turn += mu[j] * bank.direction[j]
+    if bank.peak_speed > 0.0:
+        withhold_(bank, mu, mean[1], cov[1, 1], reached, report.p)
     if bank.rear_end_gap > 0.0:
         near = rear_end_share(bank.rear_end_gap, width, mean[0], mean[2], cov)
         report.p[_REAR_END] += near * report.p[_APPROACHING]
@@ -132,7 +167,7 @@ def fill_reports_(
         report.object_id = ids[s]
         report.age = age[s]
         report.coasting = not measured[s]
-        conclude_(bank[0], obj.lane_width, obj.mu, obj.mean, obj.cov, report)
+        conclude_(bank[0], obj.lane_width, obj.mu, obj.mean, obj.cov, obj.reached, report)
         n += 1
     return n
 
@@ -167,7 +202,7 @@ def extrapolate_all_(
         report.object_id = ids[s]
         report.age = age[s]
         report.coasting = True
-        conclude_(bank[0], objects[s].lane_width, w.w, w.tx, w.tP, report)
+        conclude_(bank[0], objects[s].lane_width, w.w, w.tx, w.tP, objects[s].reached, report)
         n += 1
     return n
 

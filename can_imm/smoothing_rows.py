@@ -96,6 +96,9 @@ def conclude_rows_(
         said: (K,) what the detector reported.
         mean, cov, p: (K, n), (K, n, n), (K, M) smoothed; those of the rows said are used up.
     """
+    reached = np.ones(
+        2
+    )  # what did not is left to `hindsight`, which knows whole paths of the speed
     for k in range(first, last):
         report = out[k - first]
         a = k
@@ -112,7 +115,7 @@ def conclude_rows_(
             fill_gap_(a, b, k, lam, (now[b] - now[a]) * bank[0].step_s, mean, cov, p)
         y = mean[k, Y]
         mean[k, Y] -= shift[k]
-        conclude_(bank[0], width[k], p[k], mean[k], cov[k], report)
+        conclude_(bank[0], width[k], p[k], mean[k], cov[k], reached, report)
         mean[k, Y] = y
         report.t_ns = said[k].t_ns
         report.object_id = said[k].object_id

@@ -468,3 +468,43 @@ def test_who_is_far_away_changes_lanes_on_a_road_that_is_known_to_be_straight():
             assert Manoeuvre.LANE_CHANGE not in says(said, 1)
     assert found["straight"] == 6
     assert found["learned"] < 3
+
+
+def drifting(peak: float, rest: float) -> Callable[[float], dict[int, Vehicle]]:
+    """A vehicle beside another one: from 4 s on faster than the ego, by the first speed [m/s] for
+    four seconds, and then by the second."""
+
+    def vehicles(t: float) -> dict[int, Vehicle]:
+        knots = [4.0, 4.0 + peak / 1.5, 8.0 + peak / 1.5, 8.0 + peak / 1.5 + (peak - rest) / 1.5]
+        times = np.linspace(0.0, t, 200)
+        speeds = np.interp(times, knots, [0.0, peak, peak, rest])
+        return {
+            1: (40.0 + float(np.trapezoid(speeds, times)), float(speeds[-1]), -WIDTH, 0.0),
+            2: (30.0, 0.0, WIDTH, 0.0),
+        }
+
+    return vehicles
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_who_drifts_away_slowly_keeps_its_lane(seed: int) -> None:
+    _, said = play(drifting(0.7, 0.7), 200, seed=seed)
+    manoeuvres = says(said, 1)
+    assert manoeuvres[70:].count(Manoeuvre.KEEP_LANE) > 0.85 * 130  # none without a peak speed
+    assert says(said, 2).count(Manoeuvre.KEEP_LANE) > 190
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_who_was_faster_before_recedes_until_it_is_as_fast_as_the_ego(seed: int) -> None:
+    _, said = play(drifting(3.0, 0.75), 180, seed=seed)
+    manoeuvres = says(said, 1)
+    assert manoeuvres[55:].count(Manoeuvre.RECEDING) > 0.95 * 125
+    _, said = play(drifting(3.0, 0.0), 180, seed=seed)
+    assert says(said, 1)[130:].count(Manoeuvre.KEEP_LANE) == 50
+
+
+@pytest.mark.parametrize("speed", [-1.4, 1.4])
+def test_who_is_faster_or_slower_by_more_does_it_all_the_time(speed: float) -> None:
+    _, said = play(lambda t: {1: (60.0 + speed * t, speed, WIDTH, 0.0)}, 150)
+    manoeuvre = Manoeuvre.RECEDING if speed > 0.0 else Manoeuvre.APPROACHING
+    assert says(said, 1)[20:].count(manoeuvre) > 125

@@ -305,7 +305,24 @@ def cycle_(
         put_(n, work.x[j], work.P[j], obj.x[j], obj.P[j])
     combine_(n, bank, obj, work)
     learn_lane_(bank, obj)
+    remember_peak_(bank, obj)
     return OK
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def remember_peak_(bank: Any, obj: Any) -> None:  # pragma: no cover - compiled
+    """Whether the object has been as fast as who recedes or approaches is at some time."""
+    if bank.peak_speed <= 0.0:
+        return
+    std = math.sqrt(max(obj.cov[1, 1], bank.var_floor))
+    for side in range(2):
+        speed = (obj.mean[1] if side == 0 else -obj.mean[1]) / std
+        peak = bank.peak_speed / std
+        # the greatest of many estimates is too great
+        now = 0.5 * math.erfc((peak - speed + 1.0) * math.sqrt(0.5))
+        # until it is about as fast as the ego again
+        still = 0.5 * math.erfc((0.25 * peak - speed) * math.sqrt(0.5))
+        obj.reached[side] = max(still * obj.reached[side], now)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -365,6 +382,8 @@ def birth_(
     for j in range(n_modes):
         put_(n, work.x[j], work.P[j], obj.x[j], obj.P[j])
     combine_(n, bank, obj, work)
+    obj.reached[:] = 0.0
+    remember_peak_(bank, obj)
     return OK
 
 

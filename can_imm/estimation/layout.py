@@ -60,6 +60,7 @@ BANK_DTYPE = np.dtype(
         ("lane_range", np.float64, (2,)),
         ("lane_prior", np.float64),
         ("rear_end_gap", np.float64),
+        ("peak_speed", np.float64),
         ("soft_value", np.float64, (_M, _K)),
         ("soft_lanes", np.float64, (_M, _K, 2)),
         ("soft_r", np.float64, (_M, _K)),
@@ -75,6 +76,7 @@ BANK_DTYPE = np.dtype(
         ("manoeuvre", np.int8, (_M,)),
         ("direction", np.int8, (_M,)),
         ("off_lane", np.int8, (_M,)),
+        ("is_steady", np.int8, (_M,)),
         ("is_particle", np.int8, (_M,)),
         ("is_projected", np.int8, (_M,)),
         ("n_soft", np.int8, (_M,)),
@@ -97,6 +99,8 @@ says that state s is replaced when j is entered from i; ``entry_var`` is negativ
 ``soft_density``: the row's variance is ``soft_r`` divided by the time since the last measurement.
 ``off_lane``: what is in this mode says nothing of where the lanes are.
 ``rear_end_gap``: APPROACHING in the ego's lane is reported as REAR_END up to this gap [m]; 0 never.
+``peak_speed``: what recedes or approaches reaches this relative speed [m/s] at some time; 0: any.
+``is_steady``: who is in this mode, which holds its speed, and has not reached that does neither.
 """
 
 OBJECT_DTYPE = np.dtype(
@@ -110,6 +114,7 @@ OBJECT_DTYPE = np.dtype(
         ("Pi", np.float64, (_M, _M)),
         ("lane_width", np.float64),
         ("lane_scans", np.float64),
+        ("reached", np.float64, (2,)),
     ],
     align=True,
 )
@@ -119,6 +124,9 @@ OBJECT_DTYPE = np.dtype(
 
 ``lane_width`` is the distance of the lane centres that this object keeps to, learned in
 ``lane_scans`` scans.
+
+``reached`` are the probabilities that it has reached the bank's peak speed since it last was about
+as fast as the ego, receding and approaching.
 """
 
 WORK_DTYPE = np.dtype(

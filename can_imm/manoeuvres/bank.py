@@ -154,6 +154,7 @@ def _bank(top: Table, step_ns: int, n_steps: int) -> ModeBank:
     road = _road(top.table("road"), float(record["lane_width"])) if "road" in top else None
     record["relative_lanes"] = road is not None
     record["rear_end_gap"] = top.number("rear_end_gap", 0.0, low=0.0)
+    record["peak_speed"] = top.number("peak_speed", 0.0, low=0.0)
     n_particles = fill_particles(record, top.table("particles")) if "particles" in top else 0
 
     for j, mode in enumerate(modes):
@@ -237,6 +238,7 @@ def _fill_mode(
     record["manoeuvre"][j] = mode.choice("manoeuvre", _MANOEUVRES)
     record["direction"][j] = mode.choice("direction", _DIRECTIONS, "none")
     record["off_lane"][j] = record["manoeuvre"][j] in _OFF_LANE
+    record["is_steady"][j] = mode.flag("steady", False)
     record["is_particle"][j] = is_particle = _is_particle(mode, n_particles)
     record["is_projected"][j] = mode.flag("project", False)
     F, Q = constant_speed(n, step_s) if is_particle else read_motion(mode, states, step_s)

@@ -200,6 +200,8 @@ REFUSALS = [
     ("mode.0.x", {"model": "damped", "tau_s": 0.0, "speed_std": 1.0}, "'tau_s'"),
     ("mode.0.x", {"model": "damped", "tau_s": 1.0, "speed_std": -1.0}, "'speed_std'"),
     ("rear_end_gap", -1.0, "'rear_end_gap'"),
+    ("peak_speed", -1.0, "'peak_speed'"),
+    ("mode.0.steady", 1, "mode 'KEEP': 'steady' must be true or false"),
     ("road", {}, "road: 'width_std' is missing"),
     ("road", 3.0, "'road' must be a table"),
     ("mode.0.soft", {}, "mode 'KEEP': 'soft' must be a list"),
