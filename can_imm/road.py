@@ -9,9 +9,10 @@ import numpy as np
 
 from can_imm.estimation import road
 from can_imm.estimation.guides import NOTE_DTYPE, learn_habits_, note_, shift_objects_, watch_
-from can_imm.estimation.hypotheses import tell_changes_, tell_times_
+from can_imm.estimation.hypotheses import tell_changes_, tell_times_, weigh_
 from can_imm.estimation.traffic import (
     FREE,
+    N_LOCAL,
     begin_traffic_,
     change_lane_,
     new_traffic,
@@ -58,6 +59,7 @@ class RoadFrame:
         self._guide_of: IntArray = np.full(0, FREE, np.int32)
         self._notes: np.ndarray[Any, np.dtype[np.void]] = np.zeros(0, NOTE_DTYPE)
         self._p: FloatArray = np.zeros((0, 2))
+        self._weight: FloatArray = np.zeros(N_LOCAL)
         self.x: FloatArray = np.zeros(road.N_ROAD)
         self.P: FloatArray = np.zeros((road.N_ROAD, road.N_ROAD))
         self._begin(0.0, float(par[road.P_WIDTH]), float(par[road.P_WIDTH_STD]) ** 2)
@@ -192,9 +194,11 @@ class RoadFrame:
         Without the ego's motion nothing is known of the road, and it is taken to be straight.
         """
         n = int((ids >= 0).sum())
-        tell_changes_(self._traffic, self._guide_of, ids, t_ns * 1e-9, self._p)
+        traffic, weight, guide_of, t = self._traffic, self._weight, self._guide_of, t_ns * 1e-9
+        weigh_(traffic, weight)
+        tell_changes_(traffic, weight, guide_of, ids, t, self._p)
         judge_changes_(self._p, reports, n)
-        tell_times_(self._traffic, self._guide_of, ids, t_ns * 1e-9, reports)
+        tell_times_(traffic, weight, guide_of, ids, t, reports)
         if not math.isnan(self.acceleration):
             judge_ramps_(self.acceleration, reports, n)
 
@@ -202,7 +206,9 @@ class RoadFrame:
         """How probable it is that the objects were changing lanes at a time t [s]: (capacity, 2) by
         slot, to the left and to the right; NaN where nothing is known."""
         p = np.empty((len(self._notes), 2))
-        tell_changes_(self._traffic, self._guide_of, np.zeros(len(p), np.int32), t, p)
+        ids = np.zeros(len(p), np.int32)
+        weigh_(self._traffic, self._weight)
+        tell_changes_(self._traffic, self._weight, self._guide_of, ids, t, p)
         return p
 
     def globalise_(self, reports: np.ndarray[Any, np.dtype[np.void]], n: int) -> None:

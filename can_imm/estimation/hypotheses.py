@@ -441,29 +441,37 @@ def remove_guide_(T: Any, g: int) -> None:  # pragma: no cover - compiled
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def weigh_(T: Any, weight: FloatArray) -> None:  # pragma: no cover - compiled
+    """Probabilities (N_LOCAL,) of the local hypotheses over all global ones, written."""
+    w, total = np.empty(N_GLOBAL), np.empty((N_PARTIES, 2))
+    share = T.error
+    weight[: T.n] = 0.0
+    global_weights_(T, w)
+    for g in range(T.n_global):
+        shares_(T, g, share, total)
+        for q in range(T.n):
+            weight[q] += w[g] * share[q]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def tell_changes_(
-    T: Any, guide_of: IntArray, ids: Any, t: float, p: FloatArray
+    T: Any, weight: FloatArray, guide_of: IntArray, ids: Any, t: float, p: FloatArray
 ) -> None:  # pragma: no cover - compiled
     """How probable it is by what was measured until now that vehicles were changing lanes at t.
 
     Args:
-        T: record of `traffic.TRAFFIC_DTYPE`.
+        T: record of `traffic.TRAFFIC_DTYPE`.  weight: see `weigh_`.
         guide_of: (capacity,) party of each slot, `FREE` for none.
         ids: (capacity,) object id of each slot, -1 for a free one.
         t: [s], not longer ago than the time to settle.
         p: (N, 2) written for each slot in use, in their order: changing to the left, to the right;
             NaN where nothing was known then.
     """
-    w, share = np.empty(N_GLOBAL), np.empty(N_LOCAL)
-    total = np.empty((N_PARTIES, 2))
     sides = np.zeros((N_PARTIES, 2))
-    global_weights_(T, w)
-    for g in range(T.n_global):
-        shares_(T, g, share, total)
-        for q in range(T.n):
-            one = T.local[q]
-            if not keeping(one, t):
-                sides[one.who, 0 if one.turn > 0 else 1] += w[g] * share[q]
+    for q in range(T.n):
+        one = T.local[q]
+        if not keeping(one, t):
+            sides[one.who, 0 if one.turn > 0 else 1] += weight[q]
     row = 0
     for s in range(ids.shape[0]):
         if ids[s] < 0:
@@ -477,31 +485,25 @@ def tell_changes_(
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def tell_times_(
-    T: Any, guide_of: IntArray, ids: Any, now: float, reports: Any
+    T: Any, weight: FloatArray, guide_of: IntArray, ids: Any, now: float, reports: Any
 ) -> None:  # pragma: no cover - compiled
     """When the lane changes that are under way or have just ended begin and end: ``change`` of the
     reports of all slots in use, in their order; NaN where there is probably none.
 
     Args:
-        guide_of, ids: as for `tell_changes_`.  now: time of the last scan [s].
+        weight, guide_of, ids: as for `tell_changes_`.  now: time of the last scan [s].
         reports: (N,) of `REPORT_DTYPE`.
     """
-    w, share = np.empty(N_GLOBAL), np.empty(N_LOCAL)
-    total = np.empty((N_PARTIES, 2))
     # by party and side: weight, beginning and end from now on
     found = np.zeros((N_PARTIES, 2, 3))
-    global_weights_(T, w)
-    for g in range(T.n_global):
-        shares_(T, g, share, total)
-        for q in range(T.n):
-            one = T.local[q]
-            if one.turn == 0:
-                continue
-            v = w[g] * share[q]
-            of = found[one.who, 0 if one.turn > 0 else 1]
-            of[0] += v
-            of[1] += v * (one.start - now)
-            of[2] += v * (one.start - now + one.duration)
+    for q in range(T.n):
+        one = T.local[q]
+        if one.turn == 0:
+            continue
+        of = found[one.who, 0 if one.turn > 0 else 1]
+        of[0] += weight[q]
+        of[1] += weight[q] * (one.start - now)
+        of[2] += weight[q] * (one.start - now + one.duration)
     row = 0
     for s in range(ids.shape[0]):
         if ids[s] < 0:

@@ -879,6 +879,24 @@ def test_probabilities_are_probabilities(script: list[Any], jumpy: float) -> Non
 # ---- what is told
 
 
+def weights(traffic: Traffic) -> FloatArray:
+    weight = np.zeros(tr.N_LOCAL)
+    hy.weigh_(traffic.filter, weight)
+    return weight
+
+
+def test_a_party_does_one_thing_or_another() -> None:
+    """Its hypotheses' weights add up to one."""
+    traffic = Traffic(parameters(), capacity=4)
+    for k in range(12):
+        traffic.scan([1, 3], [[30.0, 0.0], [50.0, 0.15 * k]], speed=25.0, speeds=False)
+    T = traffic.filter
+    who, weight = T["local"]["who"][: T["n"]], weights(traffic)
+    for party in set(who.tolist()):
+        assert weight[: T["n"]][who == party].sum() == pytest.approx(1.0)
+    assert len(set(who.tolist())) == 3
+
+
 def test_slots_are_told_in_the_order_of_those_in_use() -> None:
     traffic = Traffic(parameters(), capacity=4)
     for k in range(12):
@@ -889,7 +907,7 @@ def test_slots_are_told_in_the_order_of_those_in_use() -> None:
     assert by_slot[3, 0] > 2.0 * by_slot[1, 0]
     p = np.full((3, 2), -1.0)
     ids = np.array([5, -1, 6, 7], np.int32)
-    hy.tell_changes_(traffic.filter, traffic.guide_of, ids, t, p)
+    hy.tell_changes_(traffic.filter, weights(traffic), traffic.guide_of, ids, t, p)
     assert np.isnan(p[:2]).all(), "the one is not followed, nor is that in slot 1 told"
     np.testing.assert_array_equal(p[2], by_slot[3])
     traffic.scan([1, 3], [[30.0, 0.0], [50.0, 1.8]], speed=25.0, speeds=False)
@@ -911,7 +929,7 @@ def test_when_a_lane_change_begins_and_ends(side: int) -> None:
         vy = noise[1] + [0.0, side * WIDTH * float(rate(u)) / 4.0]
         traffic.see([0, 2], np.column_stack(([30.0, 50.0], y)), vy, dt=0.07, std=0.15)
         t = 1e-9 * traffic.t_ns
-        hy.tell_times_(traffic.filter, traffic.guide_of, ids, t, reports)
+        hy.tell_times_(traffic.filter, weights(traffic), traffic.guide_of, ids, t, reports)
         told.append((t, *reports["change"].ravel().tolist()))
     t, keeps_from, keeps_to, begin, end = np.array(told).T
     assert np.isnan(keeps_from).all()
