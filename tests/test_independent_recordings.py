@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 from oracles.ars408_traffic import Truth, write_recording
 
 from can_imm.cli.main import main
@@ -103,11 +104,13 @@ def test_as_published_by_hindsight(tmp_path):
     assert share >= 0.99, wrong
 
 
+@pytest.mark.slow
 def test_smooth_lane_changes_by_hindsight(tmp_path):
     share, wrong = accuracy(replayed(tmp_path, FEW, "--smooth", smooth_changes=True))
     assert share >= 0.975, wrong
 
 
+@pytest.mark.slow
 def test_smooth_lane_changes(tmp_path):
     """Their first and last half second can hardly be seen."""
     share, wrong = accuracy(replayed(tmp_path, FEW, smooth_changes=True))
