@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 MAX_TUNING_RUNS = 500
-_KINDS = {"full": "", "plain": ", straight road", "published": ", moving as published"}
+_KINDS = {"full": "", "plain": ", straight road", "published": ", as published"}
 
 
 def add_arguments(studies: Any) -> None:
