@@ -8,7 +8,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from can_imm.estimation.constraints import normal_mass
+from can_imm.estimation.constraints import interval_probability, normal_mass
 from can_imm.estimation.imm import extrapolate_
 from can_imm.estimation.road import place
 from can_imm.types import FloatArray, Manoeuvre
@@ -88,7 +88,7 @@ def withhold_(
         if held <= 0.0:
             continue
         speed = vx if side == 0 else -vx
-        slow = 0.5 * math.erfc((speed - bank.peak_speed) / math.sqrt(2.0 * variance))
+        slow = interval_probability(speed, variance, -np.inf, bank.peak_speed)
         share = held * held / p[manoeuvre] * slow * (1.0 - reached[side])
         p[manoeuvre] -= share
         p[_KEEP_LANE] += share

@@ -86,6 +86,7 @@ class RoadFrame:
         begin_traffic_(self._traffic, self._par, t, width, width_var)
         self._guide_of[:] = FREE
         summarise_(self._traffic, self.x, self.P)
+        weigh_(self._traffic, self._weight)
 
     def _fit(self, capacity: int) -> None:
         """Room for a detector's slots; happens once, before the first scan."""
@@ -176,6 +177,7 @@ class RoadFrame:
             self._traffic, self._par, self._guide_of, self._notes, self.x, self.P,
             scan.t_ns * 1e-9, self.speed, scan.n, slot, scan.z, r, scan.valid, scan.angle,
         )  # fmt: skip
+        weigh_(self._traffic, self._weight)
         moved = 0
         if abs(self.x[road.OFFSET]) > 0.5 * self.width:
             moved = 1 if self.x[road.OFFSET] > 0.0 else -1
@@ -195,7 +197,6 @@ class RoadFrame:
         """
         n = int((ids >= 0).sum())
         traffic, weight, guide_of, t = self._traffic, self._weight, self._guide_of, t_ns * 1e-9
-        weigh_(traffic, weight)
         tell_changes_(traffic, weight, guide_of, ids, t, self._p)
         judge_changes_(self._p, reports, n)
         tell_times_(traffic, weight, guide_of, ids, t, reports)
@@ -207,7 +208,6 @@ class RoadFrame:
         slot, to the left and to the right; NaN where nothing is known."""
         p = np.empty((len(self._notes), 2))
         ids = np.zeros(len(p), np.int32)
-        weigh_(self._traffic, self._weight)
         tell_changes_(self._traffic, self._weight, self._guide_of, ids, t, p)
         return p
 

@@ -96,9 +96,8 @@ def conclude_rows_(
         said: (K,) what the detector reported.
         mean, cov, p: (K, n), (K, n, n), (K, M) smoothed; those of the rows said are used up.
     """
-    reached = np.ones(
-        2
-    )  # what did not is left to `hindsight`, which knows whole paths of the speed
+    # who was never fast is left to `hindsight`, which knows whole paths of the speed
+    reached = np.ones(2)
     for k in range(first, last):
         report = out[k - first]
         a = k

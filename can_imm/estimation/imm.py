@@ -12,7 +12,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from can_imm.estimation.constraints import normal_mass
+from can_imm.estimation.constraints import interval_probability, normal_mass
 from can_imm.estimation.interaction import mix_, nearest_lane, reference, transitions_
 from can_imm.estimation.kalman import predict_
 from can_imm.estimation.layout import (
@@ -314,14 +314,14 @@ def remember_peak_(bank: Any, obj: Any) -> None:  # pragma: no cover - compiled
     """Whether the object has been as fast as who recedes or approaches is at some time."""
     if bank.peak_speed <= 0.0:
         return
-    std = math.sqrt(max(obj.cov[1, 1], bank.var_floor))
+    variance = max(obj.cov[1, 1], bank.var_floor)
     for side in range(2):
-        speed = (obj.mean[1] if side == 0 else -obj.mean[1]) / std
-        peak = bank.peak_speed / std
+        speed = obj.mean[1] if side == 0 else -obj.mean[1]
         # the greatest of many estimates is too great
-        now = 0.5 * math.erfc((peak - speed + 1.0) * math.sqrt(0.5))
+        peak = bank.peak_speed + math.sqrt(variance)
+        now = interval_probability(speed, variance, peak, np.inf)
         # until it is about as fast as the ego again
-        still = 0.5 * math.erfc((0.25 * peak - speed) * math.sqrt(0.5))
+        still = interval_probability(speed, variance, 0.25 * bank.peak_speed, np.inf)
         obj.reached[side] = max(still * obj.reached[side], now)
 
 

@@ -238,6 +238,12 @@ def leaves(state: int, dt: float) -> float:  # pragma: no cover - compiled
     return 1.0 - math.exp(-dt / AGAIN_TIME) if state >= N_LANES else min(RATE * dt, 0.5)
 
 
+@numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+def stays(dt: float) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Logarithms of the probability that none does: in a lane, and there in passing."""
+    return math.log1p(-leaves(0, dt)), math.log1p(-leaves(N_LANES, dt))
+
+
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def find_lane_changes_(
     t: FloatArray,
@@ -280,6 +286,7 @@ def find_lane_changes_(
             lane = state % N_LANES
             if lane in (0, N_LANES - 1) or alpha[max(k - 1, 0), state] < best - IMPOSSIBLE:
                 continue
+            begins = leaves(state, dt)
             for turn in (-1, 1):
                 # at first only what passes the place where the vehicle is
                 off = y[k] / width - (lane - EDGE + 0.5 * turn)
@@ -294,7 +301,6 @@ def find_lane_changes_(
                             courses = grown(courses)
                             active = np.concatenate((active, np.zeros_like(active)))
                         start = t[k] - 0.5 * dt
-                        begins = leaves(state, dt)
                         if k == 0:
                             start = t[0] - (b + 0.5) / N_BEGUN * lasts
                             begins = RATE * lasts / N_BEGUN
@@ -311,8 +317,9 @@ def find_lane_changes_(
         if k > 0:
             f = fading(HURRY, dt)
             P = spread(P, f, HURRY, beside[k])
+            stay = stays(dt)
             for state in range(N_STATES):
-                alpha[k, state] = alpha[k - 1, state] + math.log1p(-leaves(state, dt))
+                alpha[k, state] = alpha[k - 1, state] + stay[state // N_LANES]
                 place[state], rate[state] = carried(place[state], rate[state], f)
         kept = 0
         for q in range(n_active):
@@ -400,9 +407,10 @@ def look_back_(
         # courses are in the order of their first rows
         k = n - 1 - q
         if k < n - 1:
+            stay = stays(t[k + 1] - t[k])
             for state in range(N_STATES):
-                stay = math.log1p(-leaves(state, t[k + 1] - t[k]))
-                beta[k, state] = stay + like[k + 1, state] + beta[k + 1, state]
+                after = like[k + 1, state] + beta[k + 1, state]
+                beta[k, state] = stay[state // N_LANES] + after
         while c >= 0 and courses[c].first > k:
             one = courses[c]
             add_rest_(one, n, like, beta)

@@ -133,7 +133,7 @@ def plain(settings: MotorwaySettings) -> MotorwaySettings:
 
 def published(settings: MotorwaySettings) -> MotorwaySettings:
     """The same, and everybody moves as in the published scenario: lanes are kept without wander and
-    changed at a constant rate.  So does the radar: with the noise that is published for it."""
+    changed at a constant rate.  The radar has its usual noise."""
     return replace(
         plain(settings),
         change_time=(2.0, 4.0),
