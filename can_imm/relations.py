@@ -14,6 +14,7 @@ NO_LANE = -128
 MEMORY_DTYPE = np.dtype(
     [
         ("left_ns", np.int64),
+        ("told_ns", np.int64),
         ("twin", np.int32),
         ("twin_scans", np.int32),
         ("kept", np.int16),
@@ -24,10 +25,12 @@ MEMORY_DTYPE = np.dtype(
     align=True,
 )
 """What is remembered of a slot: ``changing`` a lane change was said of it, ``belief`` what speaks
-for one that was not said yet; ``kept`` the lane it kept last, ``left`` the lane that it left to the
-left at ``left_ns`` (lanes by number, `NO_LANE` for none); ``twin`` slot of an object that has been
-in the same place for ``twin_scans`` scans."""
+for one that was not said yet [s], ``told_ns`` when that was last looked at; ``kept`` the lane it
+kept last, ``left`` the lane that it left to the left at ``left_ns`` (lanes by number, `NO_LANE` for
+none); ``twin`` slot of an object that has been in the same place for ``twin_scans`` scans."""
 
+LONGEST_NS = 100_000_000
+"""What was said counts for no longer than this [ns]."""
 OVERTAKING_NS = 20_000_000_000
 """So long after a lane change to the left [ns] passing the other lane's vehicles is overtaking."""
 AHEAD_M, BEHIND_M, FASTER = 40.0, 10.0, 0.5
@@ -48,10 +51,10 @@ def hesitate_(
     """Say that a lane change has begun only when that is sure, in place.
 
     Most of what is a lane change by a narrow margin and for a moment is a vehicle that wanders in
-    its lane.  So what its probability is above one half is summed up over the scans, as in a
-    cumulative sum test (Page, 1954).  Until the sum is ``sure`` the second most probable manoeuvre
-    is said; a lane change that was said stays until another manoeuvre is more probable.  Other
-    arguments as for `relate_`.
+    its lane.  So what its probability is above one half is summed up over the time, as in a
+    cumulative sum test (Page, 1954).  Until the sum is ``sure`` [s] the second most probable
+    manoeuvre is said; a lane change that was said stays until another manoeuvre is more probable.
+    Other arguments as for `relate_`.
     """
     k = 0
     for s in range(ids.shape[0]):
@@ -59,14 +62,16 @@ def hesitate_(
             continue
         report, m = reports[k], memory[s]
         k += 1
+        dt = min(report.t_ns - m.told_ns, LONGEST_NS) * 1e-9
+        m.told_ns = report.t_ns
         if report.age <= 1:
             m.changing = False
-            m.belief = 0.0
+            m.belief = dt = 0.0
         changing = report.manoeuvre == _LANE_CHANGE
         if not changing or m.changing:
             m.belief = 0.0
         else:
-            m.belief = max(m.belief + report.probability - 0.5, 0.0)
+            m.belief = max(m.belief + (report.probability - 0.5) * dt, 0.0)
             if m.belief < sure:
                 changing = False
                 p = report.probability

@@ -15,6 +15,7 @@ from can_imm.estimation.traffic import (
     N_LOCAL,
     begin_traffic_,
     change_lane_,
+    expect_errors_,
     new_traffic,
     predict_traffic_,
     summarise_,
@@ -148,7 +149,8 @@ class RoadFrame:
 
     def localise_(self, scan: Scan, z: FloatArray, r: FloatArray) -> None:
         """Measurements z, r (N, 4) of the scan into the road's axes, in place."""
-        r[: scan.n, 2] += np.square(scan.lasting[: scan.n])
+        if scan.lasting is not None:
+            r[: scan.n, 2] += scan.lasting.as_white(scan.z[: scan.n, 0])
         road.localise_(self.x, self.P, self._par, scan.n, z, r, scan.valid, scan.angle, self.speed)
 
     def watch_(
@@ -163,7 +165,8 @@ class RoadFrame:
         self._fit(len(objects))
         with np.errstate(over="ignore"):  # a row that is not used may say anything
             r = np.square(scan.std)
-            r[:, 2] += np.square(scan.lasting)
+        if scan.lasting is not None and self._traffic["top"] == road.N_ROAD:
+            expect_errors_(self._traffic, scan.lasting)
         note_(
             self._notes, bank.record, objects, scan.n, slot, status, age,
             scan.z, r, scan.valid, scan.angle,

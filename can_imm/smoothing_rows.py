@@ -32,7 +32,8 @@ def measurements(scan: Scan) -> tuple[FloatArray, FloatArray]:
     n = scan.n
     with np.errstate(over="ignore"):  # a row that is not used may say anything
         r = np.where(scan.valid[:n], np.square(scan.std[:n]), np.inf)
-        r[:, Y] += np.square(scan.lasting[:n])
+        if scan.lasting is not None:
+            r[:, Y] += scan.lasting.as_white(scan.z[:n, X])
     z = np.where(scan.valid[:n], scan.z[:n], 0.0)
     for k in np.flatnonzero(scan.angle[:n]):
         cos, sin = math.cos(scan.angle[k]), math.sin(scan.angle[k])

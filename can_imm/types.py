@@ -8,6 +8,7 @@ vehicle: x ahead, y to the left.
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +47,36 @@ CUT_IN, CUT_OUT, OVERTAKING_ANOTHER = 1, 2, 4
 another one whose lane it left to the left."""
 
 
+class LastingErrors(NamedTuple):
+    """Errors of measured lateral positions that last for longer than a scan.
+
+    Each object has one of its own, and all share one of the bearing: Gauss-Markov processes, whose
+    time constants are ``lasting_s`` and ``bearing_s``.  Where a track begins, its own error is
+    larger and fades more slowly.
+
+    Attributes:
+        std, lasting_s: of an object's own error [m, s].
+        bearing_std, bearing_s: of that of the bearing [rad, s].
+        new_std, new_s: of a new track's own error, times its distance [rad, s].
+        period_s: between two scans [s].
+    """
+
+    std: float
+    lasting_s: float
+    bearing_std: float
+    bearing_s: float
+    new_std: float
+    new_s: float
+    period_s: float
+
+    def as_white(self, x: FloatArray) -> FloatArray:
+        """Variances (N,) [m²] of white noise that does about the same harm at distances x (N,) [m]:
+        as many scans as share an error count as one."""
+        own = self.std**2 * max(self.lasting_s / self.period_s, 1.0)
+        shared = self.bearing_std**2 * max(self.bearing_s / self.period_s, 1.0)
+        return np.asarray(own + shared * np.square(x))
+
+
 class Scan:
     """One sensor scan in preallocated arrays; rows ``0 <= i < n`` are in use.
 
@@ -63,8 +94,7 @@ class Scan:
             object, ``z`` is (range, range rate, 0, -) and the noise is independent in these axes.
         z: (capacity, 4) measured x, vx, y, vy [m, m/s, m, m/s], in axes turned by ``angle``.
         std: (capacity, 4) standard deviations of ``z``, same units.
-        lasting: (capacity,) standard deviation of errors across the line of sight that last for
-            longer than a scan [m]: white noise of this size does the same harm.
+        lasting: errors of ``z`` that last for longer than a scan, None from a sensor without.
         valid: (capacity, 4) which components were measured; the others' values mean nothing.
         new: (capacity,) the sensor says that this id names another object than in its last scan.
         existence: (capacity,) probability that the object exists; 1 from a sensor that gives none.
@@ -88,7 +118,7 @@ class Scan:
         self.ids: IntArray = np.zeros(capacity, np.int32)
         self.z: FloatArray = np.zeros((capacity, 4))
         self.std: FloatArray = np.ones((capacity, 4))
-        self.lasting: FloatArray = np.zeros(capacity)
+        self.lasting: LastingErrors | None = None
         self.valid: BoolArray = np.zeros((capacity, 4), np.bool_)
         self.new: BoolArray = np.zeros(capacity, np.bool_)
         self.existence: FloatArray = np.ones(capacity)
@@ -110,8 +140,9 @@ class Scan:
             n,
         )
         self.ego_speed, self.ego_yaw_rate = other.ego_speed, other.ego_yaw_rate
+        self.lasting = other.lasting
         for name in (
-            "ids", "angle", "z", "std", "lasting", "valid", "new", "existence", "object_class",
+            "ids", "angle", "z", "std", "valid", "new", "existence", "object_class",
             "size",
         ):  # fmt: skip
             getattr(self, name)[:n] = getattr(other, name)[:n]

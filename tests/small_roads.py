@@ -10,7 +10,7 @@ import numpy as np
 
 from can_imm.estimation import layout, road
 from can_imm.road import RoadFrame
-from can_imm.types import FloatArray, Scan
+from can_imm.types import FloatArray, LastingErrors, Scan
 
 KEEP, LEFT, STILL = 0, 1, 2
 """Modes of `small_bank`."""
@@ -21,8 +21,9 @@ USUAL = {
     "curvature_std": 0.001, "curvature_length": 1000.0, "bias_std": 0.005, "mounting_std": 0.003,
     "yaw_noise": 0.001, "yaw_noise_unknown": 0.01, "drift": 0.05,
     "error_weight": 3.0, "error_most": 0.5, "speed_error_weight": 10.0, "speed_error_most": 2.0,
-    "beside_std": 0.25, "beside_spread": 0.5, "beside_rate": 0.5, "change_rate": 0.03,
-    "change_steady": 0.1, "settle": 1.0, "sure": 0.5,
+    "beside_std": 0.25, "beside_spread": 0.5, "beside_spread_all": 0.0,
+    "beside_margin": 1.0, "beside_rate": 0.5, "change_rate": 0.03, "change_steady": 0.1,
+    "settle": 1.0, "sure": 0.5,
 }  # fmt: skip
 
 
@@ -71,6 +72,7 @@ class Traffic:
         std: float = 0.1,
         status: int = 0,
         speeds: bool = True,
+        lasting: LastingErrors | None = None,
     ) -> int:
         """Vehicles at xy (n, 2) in the vehicle's axes, measured in axes turned by ``angle``.
 
@@ -81,6 +83,7 @@ class Traffic:
         scan = Scan(n)
         scan.n, scan.std[:], scan.angle[:], scan.valid[:] = n, std, angle, True
         scan.valid[:, 3] = speeds
+        scan.lasting = lasting
         scan.z[:, 0] = xy[:, 0] * math.cos(angle) + xy[:, 1] * math.sin(angle)
         scan.z[:, 2] = xy[:, 1] * math.cos(angle) - xy[:, 0] * math.sin(angle)
         self.t_ns += round(dt * 1e9)

@@ -66,14 +66,15 @@ def changing(direction: int, lane: int, **what: Any) -> dict[str, Any]:
 def test_a_lane_change_is_said_when_it_is_sure_and_until_it_is_over() -> None:
     memory, ids = np.zeros(3, MEMORY_DTYPE), np.array([-1, 4, 5], np.int32)
 
-    def said(p: float, age: int = 9) -> tuple[int, int, int]:
+    def said(p: float, age: int = 9, dt: float = 0.1) -> tuple[int, int, int]:
         reports = np.zeros(2, REPORT_DTYPE)
         reports["age"], reports["direction"] = age, -1
         best, second = (CHANGE, KEEP) if p >= 0.5 else (KEEP, CHANGE)
         reports["manoeuvre"], reports["second"] = best, second
         reports["probability"], reports["second_probability"] = max(p, 1 - p), min(p, 1 - p)
         reports[0]["manoeuvre"], reports[0]["second"] = KEEP, Manoeuvre.RECEDING
-        hesitate_(ids, memory, 0.3, reports, 2)
+        reports["t_ns"] = memory["told_ns"][1] + round(dt * S)
+        hesitate_(ids, memory, 0.03, reports, 2)
         assert reports[0]["manoeuvre"] == KEEP
         one = reports[1]
         assert one["probability"] == pytest.approx(p if one["manoeuvre"] == CHANGE else 1 - p)
@@ -90,8 +91,12 @@ def test_a_lane_change_is_said_when_it_is_sure_and_until_it_is_over() -> None:
     assert said(0.79)[0] == CHANGE
     assert said(0.2)[0] == KEEP
     assert said(0.81)[0] == CHANGE, "sure at once"
-    assert said(0.7, age=1)[0] == KEEP, "another object in this slot"
-    assert said(0.65)[0] == CHANGE
+    assert said(0.9, age=1)[0] == KEEP, "another object in this slot"
+    assert said(0.81)[0] == CHANGE
+    assert said(0.2)[0] == KEEP
+    assert [said(0.75, dt=0.05)[0] for _ in range(3)] == [KEEP, KEEP, CHANGE], "twice as often"
+    assert said(0.2)[0] == KEEP
+    assert said(0.75, dt=0.6)[0] == KEEP, "who was not heard for long is not surer"
 
 
 # ---- lanes

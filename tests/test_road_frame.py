@@ -17,7 +17,7 @@ from small_roads import Traffic, parameters
 from can_imm.estimation import road, traffic
 from can_imm.reporting import judge_changes_, judge_ramps_
 from can_imm.road import LONGEST_S, RoadFrame
-from can_imm.types import REPORT_DTYPE, Manoeuvre, Scan
+from can_imm.types import REPORT_DTYPE, LastingErrors, Manoeuvre, Scan
 
 S = 1_000_000_000
 NAN = math.nan
@@ -312,15 +312,17 @@ def test_errors_that_last_count_across_the_line_of_sight() -> None:
     scan.n, scan.valid[:] = 2, True
     scan.z[:] = (40.0, 0.0, 3.5, 0.0)
     added = []
-    for lasting in (0.0, 0.4):
-        scan.lasting[:] = 0.0, lasting
+    lasting = LastingErrors(0.2, 0.4, 0.004, 1.0, 0.01, 1.0, period_s=0.05)
+    for scan.lasting in (None, lasting):
         z, r = scan.z.copy(), np.full((2, 4), 0.01)
         frame.localise_(scan, z, r)
         np.testing.assert_array_equal(z[0], z[1])
         assert (r[:, 2:] > 0.01).all()
-        added.append(r[1] - r[0])
-    np.testing.assert_array_equal(added[0], 0.0)
-    np.testing.assert_allclose(added[1], [0.0, 0.0, 0.4**2, 0.0], atol=1e-12)
+        added.append(r)
+    of_y = 8 * 0.2**2 + 20 * (0.004 * 40.0) ** 2
+    np.testing.assert_allclose(added[1] - added[0], [[0.0, 0.0, of_y, 0.0]] * 2, atol=1e-12)
+    seldom = lasting._replace(period_s=2.0)
+    assert seldom.as_white(np.array([0.0, 40.0])) == pytest.approx([0.04, 0.04 + 0.16**2])
 
 
 # ---- who changes lanes

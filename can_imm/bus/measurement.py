@@ -7,13 +7,23 @@ from typing import Any
 import numpy as np
 
 from can_imm.bus.layout import CLASS, COLUMNS, EXISTENCE, LENGTH, WIDTH, Layout, total_std
-from can_imm.bus.profile_parts import Profile
-from can_imm.types import Scan, Y
+from can_imm.bus.profile_parts import Component, Profile
+from can_imm.types import LastingErrors, Scan, Y
 
 _NEAREST = 1.0
 """A polar sensor's error across is not less than it is at this range [m]."""
 
 _DEFAULTS = np.array([np.nan] * 4 + [1.0, 0.0, np.nan, np.nan])
+
+
+def _lasting(part: Component, period_s: float) -> LastingErrors | None:
+    """The lasting errors of a lateral position."""
+    if not (part.std_lasting or part.std_per_m or part.new_per_m):
+        return None
+    return LastingErrors(
+        part.std_lasting * part.factor, part.lasting_s, part.std_per_m * part.factor, part.per_m_s,
+        part.new_per_m * part.factor, part.new_s, period_s,
+    )  # fmt: skip
 
 
 class ObjectList:
@@ -33,8 +43,7 @@ class ObjectList:
             else:
                 self._defaults[state] = 1.0
         across = profile.state[Y]
-        self._lasting = across.std_lasting * across.factor if across else 0.0
-        self._per_m = across.std_per_m * across.factor if across else 0.0
+        self._lasting = _lasting(across, profile.period_ns * 1e-9) if across else None
         self._stds = any(column < 4 for column in self._columns)
         self._also = layout.also + 1
         self._fields: list[list[int]] = [[] for _ in range(self._also)]
@@ -47,6 +56,7 @@ class ObjectList:
     def prepare(self, scan: Scan) -> None:
         """Set what is the same in every scan."""
         scan.std[:] = self._defaults[:4]
+        scan.lasting = self._lasting
         scan.angle[:] = 0.0 if self._polar else self._mounting.yaw
 
     def clear(self) -> None:
@@ -117,8 +127,6 @@ class ObjectList:
             scan.existence[:n] = table[:, EXISTENCE]
             scan.object_class[:n] = table[:, CLASS]
             scan.size[:n] = table[:, [LENGTH, WIDTH]]
-        if self._lasting or self._per_m:
-            np.hypot(self._lasting, self._per_m * z[:, 0], out=scan.lasting[:n])
         if self._polar:
             self._to_cartesian_axes(scan, n)
 

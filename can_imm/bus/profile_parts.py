@@ -32,8 +32,10 @@ class Component:
 
     ``std``, ``std_floor`` and ``offset`` are in the signal's unit, ``unit``; ``factor`` takes it to
     SI units.  ``std_from`` is the signal with which the sensor sends its own standard deviation,
-    not believed below ``std_floor``.  ``std_lasting`` and, in the unit per metre of distance ahead,
-    ``std_per_m`` are errors that last for longer than a scan.
+    not believed below ``std_floor``.  ``std_lasting`` is that of an error which each object has for
+    ``lasting_s`` [s] instead of a scan; ``std_per_m``, in the unit per metre of distance ahead,
+    that of one which all objects share for ``per_m_s`` [s]; ``new_per_m``, per metre too, that of a
+    new track's own error, which fades within ``new_s`` [s].
     """
 
     signal: str
@@ -46,6 +48,10 @@ class Component:
     std_floor: float
     std_lasting: float = 0.0
     std_per_m: float = 0.0
+    lasting_s: float = 0.0
+    per_m_s: float = 0.0
+    new_per_m: float = 0.0
+    new_s: float = 0.0
 
 
 @dataclass(frozen=True)

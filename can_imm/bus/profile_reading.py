@@ -171,6 +171,10 @@ def read_component(table: Table, what: str, find: Callable[[str], Any], named: C
         table.number("std_floor", 0.0, low=0.0, high=_LARGEST),
         table.number("std_lasting", 0.0, low=0.0, high=_LARGEST),
         table.number("std_per_m", 0.0, low=0.0, high=_LARGEST),
+        table.number("lasting_s", 0.0, low=0.0, high=_LARGEST),
+        table.number("per_m_s", 0.0, low=0.0, high=_LARGEST),
+        table.number("new_per_m", 0.0, low=0.0, high=_LARGEST),
+        table.number("new_s", 0.0, low=0.0, high=_LARGEST),
     )
     table.done()
     if component.std_floor and std_from is None:
@@ -178,9 +182,18 @@ def read_component(table: Table, what: str, find: Callable[[str], Any], named: C
     for key, value in (
         ("std_lasting", component.std_lasting),
         ("std_per_m", component.std_per_m),
+        ("lasting_s", component.lasting_s),
+        ("per_m_s", component.per_m_s),
+        ("new_per_m", component.new_per_m),
+        ("new_s", component.new_s),
     ):
         if value and what != "y":
             raise table.error(f"'{key}' is for y: an error of the bearing")
+    for large, long in (
+        ("std_lasting", "lasting_s"), ("std_per_m", "per_m_s"), ("new_per_m", "new_s"),
+    ):  # fmt: skip
+        if (getattr(component, large) > 0.0) != (getattr(component, long) > 0.0):
+            raise table.error(f"'{large}' and '{long}' go together: how large, and for how long")
     return component
 
 

@@ -31,17 +31,19 @@ from can_imm.estimation.road import (
     slope_row_,
 )
 from can_imm.estimation.traffic import (
+    BEARING,
     EGO,
     FREE,
     N_GUIDES,
     N_LOCAL,
     N_PARTIES,
+    WITH_ERROR,
     best_global,
     lane_at,
     measure_,
     shares_,
 )
-from can_imm.estimation.wander import NO_LANE, forget_wander_, learn_wander_
+from can_imm.estimation.wander import N_USUAL, NO_LANE, forget_wander_, learn_wander_
 from can_imm.types import FloatArray, IntArray
 
 SEEN_TO = 250.0
@@ -61,6 +63,8 @@ MAX_OUTLIERS = 4
 """After so many in a row it is another one."""
 FEW = 6
 """Up to so many vehicles are followed as closely as can be."""
+ANEW = 2.0
+"""After so many times as long as lasting errors last, a measurement has another one."""
 CALM = 0.16
 """A vehicle that is less likely to change lanes shows how it wanders."""
 MOST_LANES = 5
@@ -215,6 +219,15 @@ def still_twin(T: Any, notes: Any, s: int, g: int) -> bool:  # pragma: no cover 
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def listen_(T: Any, usual: FloatArray) -> None:  # pragma: no cover - compiled
+    """Log evidence (N_USUAL,) of all vehicles for how much is usual to wander, written."""
+    for k in range(N_USUAL):
+        usual[k] = T.gone[k]
+        for g in range(N_GUIDES):
+            usual[k] += T.party[g].told[k]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def meet_(
     T: Any, par: FloatArray, guide_of: IntArray, notes: Any, s: int, t: float
 ) -> int:  # pragma: no cover - compiled
@@ -249,11 +262,15 @@ def meet_(
     party = T.party[g]
     party.slot, party.unseen, party.outliers, party.since = s, 0.0, 0, t
     guide_of[s] = g
-    a = N_ROAD + 2 * g
-    T.top = max(T.top, a + 2)
-    forget_wander_(party, par)
+    a = T.first + T.stride * g
+    T.top = max(T.top, a + T.stride)
+    usual = np.empty(N_USUAL)
+    listen_(T, usual)
+    forget_wander_(party, usual, par)
     T.P[a, a] = party.beside**2
     T.P[a + 1, a + 1] = (par[P_BESIDE_RATE] * party.beside) ** 2
+    if T.stride == WITH_ERROR:
+        T.P[a + 2, a + 2] = T.lasting_std**2 + (T.new_std * notes[s].x) ** 2
     for lane in lanes[:n_lanes]:
         q = add_local_(T, g, lane, 0, False, 0.0, 0.0, -1)
         for k in range(T.n_global):
@@ -290,12 +307,18 @@ def see_place_(
         if h[i] != 0.0:
             h[m], at[m] = h[i], i
             m += 1
-    h[m], at[m] = 1.0, N_ROAD + 2 * g
+    a = T.first + T.stride * g
+    h[m], at[m] = 1.0, a
+    m += 1
+    if T.stride == WITH_ERROR:
+        h[m], at[m] = x, BEARING
+        h[m + 1], at[m + 1] = 1.0, a + 2
+        m += 2
     for q in range(T.n):
         if T.local[q].who == g:
             other, _, _ = lane_at(T.local[q], t)
             T.shift[q] = (other - lane) * width
-    return measure_(T, m + 1, y, noise, g, GATE)
+    return measure_(T, m, y, noise, g, GATE)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -321,7 +344,7 @@ def see_speed_(
         if v != 0.0:
             h[m], at[m] = v, i
             m += 1
-    h[m], at[m] = 1.0, N_ROAD + 2 * g + 1
+    h[m], at[m] = 1.0, T.first + T.stride * g + 1
     for q in range(T.n):
         if T.local[q].who == g:
             _, other, _ = lane_at(T.local[q], t)
@@ -394,7 +417,7 @@ def watch_(
             if twin != FREE:
                 leave_(T, guide_of, g)
                 guide_of[s] = twin
-    apart = APART * max(1.0, (T.top - N_ROAD) / (2.0 * FEW))
+    apart = APART * max(1.0, (T.top - T.first) / float(T.stride * FEW))
     nowhere = np.empty(0)
     new, n_new = np.empty(n, np.int64), 0
     for k in range(n):
@@ -458,6 +481,8 @@ def learn_habits_(
     v = speed if speed == speed else USUAL_SPEED
     best = best_global(T)
     shares_(T, best, share, np.empty((N_PARTIES, 2)))
+    usual, others = np.empty(N_USUAL), np.empty(N_USUAL)
+    listen_(T, usual)
     for q in range(T.n):
         if not keeping(T.local[q], t):
             changing[T.local[q].who] += share[q]
@@ -473,6 +498,8 @@ def learn_habits_(
             party.kept = NO_LANE
             continue
         lane = ours.lane + (ours.turn if t >= ours.start else 0)
+        if lane == party.kept and t - party.learnt < ANEW * T.lasting_s:
+            continue
         note = notes[s]
         vx, vy, rv = 0.0, 0.0, np.inf
         if valid[k, 1]:
@@ -482,9 +509,15 @@ def learn_habits_(
         y, its_vy, of_place, of_direction = place_and_errors(road, P, h, note.x, vx, v)
         if rv < np.inf:
             rv += of_direction * (v + vx) ** 2
+        for i in range(N_USUAL):
+            others[i] = usual[i] - party.told[i]
+        noise = note.noise
+        if T.stride == WITH_ERROR:
+            y += T.x[BEARING] * note.x
+            noise += T.lasting_std**2 + T.P[BEARING, BEARING] * note.x**2
         learn_wander_(
-            party, lane, t, note.y - y - lane * road[WIDTH], note.noise, vy - its_vy, rv,
-            of_place, par[P_BESIDE_RATE], par,
+            party, lane, t, note.y - y - lane * road[WIDTH], noise, vy - its_vy, rv,
+            of_place, par[P_BESIDE_RATE], others, par,
         )  # fmt: skip
 
 

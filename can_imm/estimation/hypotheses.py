@@ -10,7 +10,6 @@ import numpy as np
 
 from can_imm.estimation.lane_changes import SPREAD, STEADY_TIME, USUAL, add_logs
 from can_imm.estimation.road import (
-    N_ROAD,
     P_CHANGE_RATE,
     P_CHANGE_STEADY,
     P_SETTLE,
@@ -24,6 +23,7 @@ from can_imm.estimation.traffic import (
     global_weights_,
     shares_,
 )
+from can_imm.estimation.wander import N_USUAL
 from can_imm.types import FloatArray, IntArray
 
 N_DURATIONS = 11
@@ -44,9 +44,15 @@ APART = 0.06
 is less than between the scans of a radar at 14 Hz, of which rounding would leave out some."""
 IMPOSSIBLE = 13.5
 """What is less likely than the best by this, as a logarithm, is given up."""
-TRUST = 0.5
-"""What is usual of lane changes counts as much as so many that were seen.  It is little: people's
-are all smooth, simulated ones often all at a constant rate."""
+STEADY_SHARES = np.array([0.04, 0.5, 0.96])
+MIXED = 0.1
+"""Shares of the lane changes of a drive at a constant rate that are told apart; that there are both
+kinds is so probable.  It is little: people's are all smooth, simulated ones often all at a constant
+rate."""
+ONE_ENDED = 0.9
+"""When so much of a lane change has ended, as a probability, it counts as one."""
+LEAST_HABIT = 1e-3
+"""Nothing that was seen makes a share less likely than this against another one: habits change."""
 RARE = 7.0
 """What is less likely by this begins no courses."""
 SPLIT = 4.0
@@ -88,8 +94,36 @@ def add_local_(
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def steady_share(T: Any, par: FloatArray) -> float:  # pragma: no cover - compiled
     """Share of the lane changes that are at a constant rate, by those that have ended."""
-    n = TRUST + T.ended[0] + T.ended[1]
-    return float((TRUST * par[P_CHANGE_STEADY] + T.ended[1]) / n)
+    mean = total = 0.0
+    for k in range(len(STEADY_SHARES)):
+        prior = MIXED
+        if k != 1:
+            prior = par[P_CHANGE_STEADY] if k == 2 else 1.0 - par[P_CHANGE_STEADY]
+            prior *= 1.0 - MIXED
+        w = prior * T.habits[k]
+        total += w
+        mean += w * STEADY_SHARES[k]
+    return float(mean / total)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def learn_habit_(T: Any, who: int, par: FloatArray) -> None:  # pragma: no cover - compiled
+    """A lane change of a party has ended: what it was like; in place.
+
+    It counts by how much likelier what was measured is under one kind than under the other, not by
+    which kind is likelier: that would confirm what was thought before.
+    """
+    smooth, steady = T.party[who].ended
+    share = steady_share(T, par)
+    T.party[who].ended[:] = 0.0
+    smooth /= 1.0 - share
+    steady /= share
+    most = 0.0
+    for k in range(len(STEADY_SHARES)):
+        T.habits[k] *= STEADY_SHARES[k] * steady + (1.0 - STEADY_SHARES[k]) * smooth
+        most = max(most, T.habits[k])
+    for k in range(len(STEADY_SHARES)):
+        T.habits[k] = max(T.habits[k] / most, LEAST_HABIT)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -189,8 +223,9 @@ def total_odds(T: Any, g: int, who: int) -> float:  # pragma: no cover - compile
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def settle_(T: Any, who: int, t: float, settle: float) -> None:  # pragma: no cover - compiled
-    """A course that ended ``settle`` seconds ago is one with the lane that it led to; in place."""
+def settle_(T: Any, who: int, t: float, par: FloatArray) -> None:  # pragma: no cover - compiled
+    """A course that ended some time ago is one with the lane that it led to; in place."""
+    ended, settle = T.party[who].ended, par[P_SETTLE]
     best, total = best_global(T), np.nan
     for q in range(T.n):
         one = T.local[q]
@@ -201,7 +236,7 @@ def settle_(T: Any, who: int, t: float, settle: float) -> None:  # pragma: no co
             one.turn = 0
             if total != total:
                 total = total_odds(T, best, who)
-            T.ended[1 if one.steady else 0] += math.exp(T.odds[best, q] - total)
+            ended[1 if one.steady else 0] += math.exp(T.odds[best, q] - total)
         if one.turn != 0:
             continue
         for p in range(q):
@@ -210,6 +245,8 @@ def settle_(T: Any, who: int, t: float, settle: float) -> None:  # pragma: no co
                 merge_(T, p, q)
                 total = np.nan  # odds count from what is chosen
                 break
+    if ended[0] + ended[1] >= ONE_ENDED:
+        learn_habit_(T, who, par)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -219,7 +256,7 @@ def merge_(T: Any, p: int, q: int) -> None:  # pragma: no cover - compiled
     best = best_global(T)
     total = add_logs(T.odds[best, p], T.odds[best, q])
     w = math.exp(T.odds[best, q] - total) if total > -np.inf else 0.0
-    for i in range(T.mean.shape[1]):
+    for i in range(T.top):
         T.mean[p, i] += w * (T.mean[q, i] - T.mean[p, i])
     for g in range(T.n_global):
         T.odds[g, p] = add_logs(T.odds[g, p], T.odds[g, q])
@@ -354,7 +391,7 @@ def drop_locals_(T: Any, gone: int) -> None:  # pragma: no cover - compiled
         for g in range(T.n_global):
             q = T.choice[g, gone]
             if q != FREE:
-                for i in range(T.mean.shape[1]):
+                for i in range(T.top):
                     T.rest[g, i] += T.mean[q, i]
                 T.choice[g, gone] = FREE
     least = T.log_w[best_global(T)] - IMPOSSIBLE
@@ -412,7 +449,7 @@ def centre_(T: Any) -> None:  # pragma: no cover - compiled
 def consider_(T: Any, t: float, par: FloatArray) -> None:  # pragma: no cover - compiled
     """After all measurements of a scan at time t [s]: settle, split, give up; in place."""
     for who in range(N_PARTIES):
-        settle_(T, who, t, par[P_SETTLE])
+        settle_(T, who, t, par)
     split_(T)
     drop_globals_(T)
     drop_locals_(T, -1)
@@ -423,8 +460,13 @@ def consider_(T: Any, t: float, par: FloatArray) -> None:  # pragma: no cover - 
 def remove_guide_(T: Any, g: int) -> None:  # pragma: no cover - compiled
     """A vehicle is no longer followed; what it has shown of the road stays known."""
     T.party[g].slot = FREE
+    for k in range(N_USUAL):
+        T.gone[k] += T.party[g].told[k]
+        T.party[g].told[k] = 0.0
+    T.party[g].ended[:] = 0.0
     drop_locals_(T, g)
-    for a in (N_ROAD + 2 * g, N_ROAD + 2 * g + 1):
+    first = T.first + T.stride * g
+    for a in range(first, first + T.stride):
         T.x[a] = 0.0
         for q in range(T.n):
             T.mean[q, a] = 0.0
@@ -437,7 +479,7 @@ def remove_guide_(T: Any, g: int) -> None:  # pragma: no cover - compiled
     for k in range(N_PARTIES - 1):
         if T.party[k].slot != FREE:
             top = k + 1
-    T.top = N_ROAD + 2 * top
+    T.top = T.first + T.stride * top
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

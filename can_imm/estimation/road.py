@@ -62,6 +62,8 @@ PARAMETERS = (
     "speed_error_most",
     "beside_std",
     "beside_spread",
+    "beside_spread_all",
+    "beside_margin",
     "beside_rate",
     "change_rate",
     "change_steady",
@@ -80,16 +82,18 @@ noise: however little is known of where the lanes are far ahead, that a vehicle 
 seen.
 
 For `estimation.traffic`: ``beside_std`` [m] of a vehicle's place beside its course,
-``beside_spread`` of its logarithm among vehicles, ``beside_rate`` [1/s]: how fast such a place is
-forgotten; ``change_rate`` [1/s] of lane changes, ``change_steady``: share of them at a constant
-rate before any was seen, ``settle`` [s]: so long after it a lane change may still turn out to be
-none; ``sure``: see `relations.hesitate_`.
+``beside_spread`` of its logarithm among the vehicles of a drive, ``beside_spread_all`` from drive
+to drive, ``beside_margin``: what was learnt of it counts times this, ``beside_rate`` [1/s]: how
+fast such a place is forgotten; ``change_rate`` [1/s] of lane changes, ``change_steady``: how
+probable it is that those of a drive are at a constant rate before any was seen, ``settle`` [s]: so
+long after it a lane change may still turn out to be none; ``sure``: see `relations.hesitate_`.
 """
 (
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,
     P_TURN_STD, P_TURN_TIME, P_CURVATURE_STD, P_CURVATURE_LENGTH, P_BIAS_STD, P_MOUNTING_STD,
     P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_ERROR_WEIGHT, P_ERROR_MOST,
-    P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST, P_BESIDE_STD, P_BESIDE_SPREAD, P_BESIDE_RATE,
+    P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST, P_BESIDE_STD, P_BESIDE_SPREAD,
+    P_BESIDE_SPREAD_ALL, P_BESIDE_MARGIN, P_BESIDE_RATE,
     P_CHANGE_RATE, P_CHANGE_STEADY, P_SETTLE, P_SURE,
 ) = range(len(PARAMETERS))  # fmt: skip
 

@@ -56,16 +56,21 @@ from can_imm.estimation.road import (
     bend_row_,
     new_road,
 )
-from can_imm.estimation.wander import NO_LANE, WANDER_FIELDS
-from can_imm.types import FloatArray
+from can_imm.estimation.wander import N_USUAL, NO_LANE, WANDER_FIELDS
+from can_imm.types import FloatArray, LastingErrors
 
 N_GUIDES = 24
 """Most vehicles that are followed."""
 EGO = N_GUIDES
 """Number of the ego among the parties; those before it are the vehicles."""
 N_PARTIES = N_GUIDES + 1
-N = N_ROAD + 2 * N_GUIDES
-"""Length of the state: the road, and of each vehicle its place beside its course and the rate."""
+BEARING = N_ROAD
+"""Index of the sensor's lasting error of the bearing, where it has lasting errors."""
+WITHOUT_ERROR, WITH_ERROR = 2, 3
+"""States of a vehicle: its place beside its course and the rate; and the lasting error of where it
+is measured."""
+N = N_ROAD + 1 + WITH_ERROR * N_GUIDES
+"""Greatest length of the state."""
 N_LOCAL = 6144
 """Most local hypotheses, of all parties together."""
 N_GLOBAL = 12
@@ -81,6 +86,14 @@ TRAFFIC_DTYPE = np.dtype(
         ("P", np.float64, (N, N)),
         ("n", np.int64),
         ("top", np.int64),
+        ("first", np.int64),
+        ("stride", np.int64),
+        ("lasting_std", np.float64),
+        ("lasting_s", np.float64),
+        ("bearing_std", np.float64),
+        ("bearing_s", np.float64),
+        ("new_std", np.float64),
+        ("new_s", np.float64),
         (
             "local",
             [
@@ -94,9 +107,10 @@ TRAFFIC_DTYPE = np.dtype(
             (N_LOCAL,),
         ),
         ("mean", np.float64, (N_LOCAL, N)),
-        ("ended", np.float64, (2,)),
+        ("habits", np.float64, (3,)),
         ("bends", np.float64),
         ("driven", np.float64),
+        ("gone", np.float64, (N_USUAL,)),
         ("n_global", np.int64),
         ("log_w", np.float64, (N_GLOBAL,)),
         ("choice", np.int32, (N_GLOBAL, N_PARTIES)),
@@ -110,6 +124,7 @@ TRAFFIC_DTYPE = np.dtype(
                 ("unseen", np.float64),
                 ("begun", np.float64),
                 ("since", np.float64),
+                ("ended", np.float64, (2,)),
                 *WANDER_FIELDS,
             ],
             (N_PARTIES,),
@@ -128,14 +143,19 @@ local hypotheses q = ``choice[g]`` of all parties; ``P`` covariance of all.
 
 ``n`` local hypotheses are in use: party ``who`` changes from ``lane`` (0 the ego's) by ``turn`` (+1
 left, -1 right, 0 none) from ``start`` on within ``duration`` [s], at a constant rate if ``steady``.
-``ended`` so many lane changes seem to have ended: smooth ones, such at a constant rate; ``bends``
-and ``driven``: see `learn_curvature_`.  ``log_w`` logarithms of the weights of the ``n_global``
-global hypotheses, ``odds`` what is to be added if one party had another course.
+``habits``: how likely each of `hypotheses.STEADY_SHARES` is by the lane changes that have ended;
+``bends`` and ``driven``: see `learn_curvature_`; ``gone``: log evidence (`wander`) by the vehicles
+that have left.  ``log_w`` logarithms of the weights of the ``n_global`` global hypotheses, ``odds``
+what is to be added if one party had another course.
 
 Of a party: the detector's ``slot``, `FREE` for none; so many ``outliers`` in a row; for how long it
-is ``unseen``, when courses have ``begun`` last, ``since`` when it is followed [s]; and how it
-wanders (`wander`).  ``top``: states in use.  The rest is scratch: a measurement's row ``h`` for the
-states ``at``, ``shift`` by which a party's courses change what is expected, their ``error``."""
+is ``unseen``, when courses have ``begun`` last, ``since`` when it is followed [s]; so much has
+``ended`` of a lane change, smooth and at a constant rate; and how it wanders (`wander`).
+
+``top``: states in use; the vehicles' begin with the ``first``, and each has ``stride`` of them,
+`WITH_ERROR` or `WITHOUT_ERROR`.  The sensor's lasting errors, as in `types.LastingErrors`.  The
+rest is scratch: a measurement's row ``h`` for the states ``at``, ``shift`` by which a party's
+courses change what is expected, their ``error``."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -181,18 +201,32 @@ def begin_traffic_(T: Any, par: FloatArray, t: float, width: float, width_var: f
     T["P"][:] = 0.0
     T["x"][:N_ROAD], T["P"][:N_ROAD, :N_ROAD] = new_road(par)
     T["x"][WIDTH], T["P"][WIDTH, WIDTH] = width, width_var
-    T["top"] = N_ROAD
+    T["first"] = T["top"] = N_ROAD
+    T["stride"] = WITHOUT_ERROR
+    T["lasting_std"] = T["lasting_s"] = T["bearing_std"] = T["bearing_s"] = 0.0
     T["party"]["slot"] = FREE
     T["party"]["begun"][EGO] = t
     T["choice"][:] = FREE
     T["choice"][0, EGO] = 0
     T["rest"][:] = 0.0
     T["log_w"][:] = 0.0
-    T["ended"][:] = T["bends"] = T["driven"] = 0.0
+    T["habits"] = 1.0
+    T["gone"][:] = T["bends"] = T["driven"] = 0.0
+    T["party"]["told"] = T["party"]["ended"] = 0.0
     T["n_global"] = T["n"] = 1
     T["local"][0] = (0.0, 0.0, EGO, 0, 0, False)
     T["mean"][0] = 0.0
     T["odds"][0, 0] = 0.0
+
+
+def expect_errors_(T: Any, errors: LastingErrors) -> None:
+    """The sensor has lasting errors; said while nobody is followed yet."""
+    T["first"] = T["top"] = BEARING + 1
+    T["stride"] = WITH_ERROR
+    T["lasting_std"], T["lasting_s"] = errors.std, errors.lasting_s
+    T["bearing_std"], T["bearing_s"] = errors.bearing_std, errors.bearing_s
+    T["new_std"], T["new_s"] = errors.new_std, errors.new_s
+    T["P"][BEARING, BEARING] = errors.bearing_std**2
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -311,6 +345,10 @@ for what is known of the road."""
 ROAD_TRUST, ROAD_MEMORY = 0.5, 8.0
 """How bent roads usually are counts as much as what is seen of a road of the first length, and what
 was seen counts for the second, both in units of how long the curvature stays the same."""
+NEW_TIMES = 3.0
+"""A track is new for so many times as long as its first error lasts."""
+GONE_S = 300.0
+"""So long it counts how vehicles have wandered that are followed no longer [s]."""
 MOST_LOST = 40.0
 """A squared normalised error counts as this at most."""
 
@@ -337,6 +375,22 @@ def carry_guide_(
         place, rate = rows[q, a], rows[q, a + 1]
         rows[q, a] = f[0] * place + f[1] * rate
         rows[q, a + 1] = f[2] * place + f[3] * rate
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def forget_error_(T: Any, i: int, fade: float, come: float) -> None:  # pragma: no cover - compiled
+    """``fade`` is left of a lasting error, state i, and its variance grows by what has ``come``; in
+    place."""
+    T.x[i] *= fade
+    for q in range(T.n):
+        T.mean[q, i] *= fade
+    for g in range(T.n_global):
+        T.rest[g, i] *= fade
+    for j in range(T.top):
+        T.P[i, j] *= fade
+    for j in range(T.top):
+        T.P[j, i] *= fade
+    T.P[i, i] += come
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -372,7 +426,12 @@ def usual_curvature(T: Any, par: FloatArray) -> float:  # pragma: no cover - com
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def predict_traffic_(
-    T: Any, par: FloatArray, dt: float, t: float, speed: float, yaw_rate: float
+    T: Any,
+    par: FloatArray,
+    dt: float,
+    t: float,
+    speed: float,
+    yaw_rate: float,
 ) -> None:  # pragma: no cover - compiled
     """Move all on by ``dt`` seconds to time t [s], in place.
 
@@ -410,12 +469,21 @@ def predict_traffic_(
     P[HEADING, HEADING] += yaw**2 * dt
     P[OFFSET, OFFSET] += par[P_DRIFT] ** 2 * dt
     P[BIAS, BIAS] += par[P_BIAS_STD] ** 2 * (1.0 - F[BIAS, BIAS] ** 2)
+    if T.stride == WITH_ERROR:
+        come = T.bearing_std**2 * (1.0 - math.exp(-2.0 * dt / T.bearing_s))
+        forget_error_(T, BEARING, math.exp(-dt / T.bearing_s), come)
     hurry = par[P_BESIDE_RATE]
     f = fading(hurry, dt)
     for g in range(N_GUIDES):
         if T.party[g].slot == FREE:
             continue
-        a = N_ROAD + 2 * g
+        a = T.first + T.stride * g
+        if T.stride == WITH_ERROR:
+            lasts = T.lasting_s
+            if t - T.party[g].since < NEW_TIMES * T.new_s:
+                lasts = T.new_s
+            come = T.lasting_std**2 * (1.0 - math.exp(-2.0 * dt / T.lasting_s))
+            forget_error_(T, a + 2, math.exp(-dt / lasts), come)
         carry_guide_(x.reshape(1, N), 1, a, f)
         carry_guide_(T.mean, n, a, f)
         carry_guide_(T.rest, n_global, a, f)
@@ -442,6 +510,8 @@ def predict_traffic_(
         last = N_ROAD - 1
         P[last, last] += usual_curvature(T, par) ** 2 * (1.0 - memory**2)
     drive_(T, par, dt, t, v, yaw_rate if known else np.nan)
+    for k in range(N_USUAL):
+        T.gone[k] *= math.exp(-dt / GONE_S)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -10,7 +10,7 @@ from can_imm.bus.decoder import ScanDecoder
 from can_imm.bus.describe import describe
 from can_imm.bus.frame import Frame
 from can_imm.bus.profile import builtin_profiles, load_profile
-from can_imm.types import CanImmError
+from can_imm.types import CanImmError, Scan
 
 
 def test_built_in_profiles():
@@ -87,8 +87,12 @@ BAD_NEW = [
     ("toyota", "std = 0.15 ", "std = 0.15, std_per_m = 0.01 ", "vx: 'std_per_m' is for y"),
     ("ars408", "std = 0.3, ", "std = 0.3, std_per_m = 0.01, ", "'std_per_m' is for y"),
     ("esr", "std = 0.5 }", "std = 0.5, std_per_m = 0.01 }", "bearing: 'std_per_m' is for y"),
-    ("toyota", "std_per_m = 0.012", "std_per_m = -0.012", "y: 'std_per_m' must be a number from 0"),
-    ("toyota", "std_per_m = 0.012", "std_per_m = nan", "y: 'std_per_m' must be a number from 0"),
+    ("toyota", "std_per_m = 0.004", "std_per_m = -0.01", "y: 'std_per_m' must be a number from 0"),
+    ("toyota", "std_per_m = 0.004", "std_per_m = nan", "y: 'std_per_m' must be a number from 0"),
+    ("toyota", "per_m_s = 1.0", "", "y: 'std_per_m' and 'per_m_s' go together"),
+    ("toyota", "lasting_s = 0.4", "lasting_s = 0", "y: 'std_lasting' and 'lasting_s' go together"),
+    ("toyota", "new_per_m = 0.01", "", "y: 'new_per_m' and 'new_s' go together"),
+    ("toyota", "new_s = 1.0", "new_s = -1", "y: 'new_s' must be a number from 0"),
     ("ars408", "number = 8", "number = 0", "sensors: 'number' must be a whole number from 1"),
     ("ars408", "number = 8", "number = 8\nuse = 8", "sensors: 'use' must be a whole number from 0"),
     ("ars408", "new_codes = [1, 5]", "new_codes = [1.5]", "'new_codes' must be a list of whole"),
@@ -180,26 +184,34 @@ OWN_Y = 'y = { signal = "DistLat", std = 0.2'
 @pytest.mark.parametrize(
     ("more", "expected"),
     [
-        ("", {10.0: 0.0, 100.0: 0.0}),
-        (", std_per_m = 0.0", {10.0: 0.0, 100.0: 0.0}),
-        (", std_lasting = 0.3", {10.0: 0.3, 100.0: 0.3}),
-        (", std_per_m = 0.015", {10.0: 0.15, 100.0: 1.5}),
-        (", std_per_m = 0.015, std_lasting = 0.2", {10.0: 0.25, 100.0: 1.513275}),
-        (', std_per_m = 0.015, unit = "cm"', {10.0: 0.0015, 100.0: 0.015}),
+        ("", None),
+        (", std_per_m = 0.0", None),
+        (", std_lasting = 0.3, lasting_s = 0.4", (0.3, 0.4, 0.0, 0.0, 0.0, 0.0, 0.1)),
+        (", std_per_m = 0.015, per_m_s = 2", (0.0, 0.0, 0.015, 2.0, 0.0, 0.0, 0.1)),
+        (", new_per_m = 0.02, new_s = 1.5", (0.0, 0.0, 0.0, 0.0, 0.02, 1.5, 0.1)),
+        (
+            ', std_per_m = 0.015, per_m_s = 2, std_lasting = 20, lasting_s = 0.4, unit = "cm"',
+            (0.2, 0.4, 0.00015, 2.0, 0.0, 0.0, 0.1),
+        ),
     ],
 )
 def test_errors_that_last(tmp_path, radar, more, expected):
     decoder = ScanDecoder(profile_with(tmp_path, "can_imm", OWN_Y, OWN_Y + more))
-    frames = [radar.scan(len(expected))]
-    frames += [radar.object(k, DistLong=x, DistLat=-3.0) for k, x in enumerate(expected)]
+    frames = [radar.scan(2), radar.object(0, DistLong=10.0), radar.object(1, DistLong=100.0)]
     (scan,) = (found for frame in frames if (found := decoder.feed(Frame(0, *frame))))
-    assert scan.z[: scan.n, 0].tolist() == pytest.approx(list(expected))
-    assert scan.lasting[: scan.n].tolist() == pytest.approx(list(expected.values()))
+    assert scan.z[: scan.n, 0].tolist() == pytest.approx([10.0, 100.0])
+    if expected is None:
+        assert scan.lasting is None
+    else:
+        assert tuple(scan.lasting) == pytest.approx(expected)
+    other = Scan(2)
+    other.copy_from(scan)
+    assert other.lasting == scan.lasting
     y = 0.002 if "cm" in more else 0.2
     assert scan.std[: scan.n, :3] == pytest.approx(np.tile([0.1, 0.3, y], (scan.n, 1)), rel=0.05)
 
 
-def test_profiles_check_tells_of_std_per_m(tmp_path):
+def test_profiles_check_tells_of_errors_that_last(tmp_path):
     def of_y(profile):
         ((line, _),) = (
             (line, part)
@@ -210,11 +222,12 @@ def test_profiles_check_tells_of_std_per_m(tmp_path):
         return line
 
     assert of_y(load_profile("toyota")).endswith(
-        "; lasting errors of 0.57 and 0.012 per metre ahead"
+        "; an error of 0.25 that lasts 0.4 s; of 0.01 per metre ahead in new tracks, 1 s; "
+        "of 0.004 per metre that all share, 1 s"
     )
     assert "per metre" not in of_y(load_profile("can_imm"))
-    changed = profile_with(tmp_path, "can_imm", OWN_Y, OWN_Y + ", std_per_m = 0.02")
-    assert "(0.2 and rounding); lasting errors of 0 and 0.02 per metre ahead" in of_y(changed)
+    changed = profile_with(tmp_path, "can_imm", OWN_Y, OWN_Y + ", std_per_m = 0.02, per_m_s = 3")
+    assert "(0.2 and rounding); of 0.02 per metre that all share, 3 s" in of_y(changed)
 
 
 @pytest.mark.parametrize("name", ["ars999", "", "none.toml", "sub/none"])

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from small_roads import Traffic, parameters
 
 from can_imm.estimation import traffic as tr
@@ -18,12 +20,14 @@ from can_imm.types import FloatArray
 HURRY, ROAD_ERROR = 0.5, 0.02
 STD, SPEED_STD = 0.15, 0.3
 WIDTH, EGO_SPEED = 3.5, 25.0
+NOTHING = np.zeros(wander.N_USUAL)
+"""What others have told before any was seen."""
 
 
 def somebody(par: FloatArray) -> Any:
     one = np.zeros(1, np.dtype(wander.WANDER_FIELDS, align=True))
     one["evidence"] = one["level_place"] = one["level_rate"] = 77.0
-    wander.forget_wander_(one[0], par)
+    wander.forget_wander_(one[0], NOTHING, par)
     return one[0]
 
 
@@ -60,7 +64,7 @@ def learn(
         wander.learn_wander_(
             one, lane, t[k],
             rows[k, 0], STD**2 if with_place else np.inf,
-            rows[k, 1], SPEED_STD**2 if with_speed else np.inf, ROAD_ERROR, HURRY, par,
+            rows[k, 1], SPEED_STD**2 if with_speed else np.inf, ROAD_ERROR, HURRY, NOTHING, par,
         )  # fmt: skip
 
 
@@ -116,7 +120,7 @@ def test_an_outlier_is_cut() -> None:
         one = somebody(par)
         t = np.arange(0.0, 6.0, 0.1)
         learn(one, par, t, np.zeros((60, 2)), 0)
-        wander.learn_wander_(one, 0, 6.0, off, STD**2, 0.0, np.inf, ROAD_ERROR, HURRY, par)
+        wander.learn_wander_(one, 0, 6.0, off, STD**2, 0.0, np.inf, ROAD_ERROR, HURRY, NOTHING, par)
         stds.append(float(one["beside"]))
     assert stds[0] < 0.15
     assert stds[1:] == pytest.approx([stds[0]] * 2, rel=0.05)
@@ -168,6 +172,52 @@ def test_what_was_learnt_fades_with_time(gap: float, lane: int) -> None:
         e = np.linalg.solve(factor, row - x)
         evidence[i] -= 0.5 * e @ e + np.log(np.diag(factor)).sum()
     np.testing.assert_allclose(one["evidence"], evidence - evidence.max(), atol=1e-9)
+
+
+# ---- what is usual
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.6), st.floats(0.01, 1.0), st.floats(0.01, 1.0))
+def test_who_is_like_the_others(seed: int, std: float, spread: float, spread_all: float) -> None:
+    """Levels are drawn about a median, which is drawn about the preset's and told by others."""
+    rng = np.random.default_rng(seed)
+    par = parameters(
+        beside_std=std, beside_spread=spread, beside_spread_all=spread_all, beside_margin=1.5
+    )
+    one = somebody(par)
+    one["evidence"] = -rng.exponential(3.0, wander.N_LEVELS)
+    others = rng.normal(0.0, 3.0, wander.N_USUAL)
+    wander.weigh_levels_(one, others, par)
+    z = np.linspace(-4.0, 4.0, wander.N_USUAL)
+    medians = math.log(std) + spread_all * z
+    log_p = -0.5 * ((np.log(wander.LEVELS) - medians[:, None]) / spread) ** 2
+    log_p -= np.logaddexp.reduce(log_p, axis=1)[:, None]
+    told = np.logaddexp.reduce(log_p + one["evidence"], axis=1)
+    np.testing.assert_allclose(one["told"], told, atol=1e-9)
+    w = log_p + one["evidence"] + (others - 0.5 * z**2)[:, None]
+    w = np.exp(w - w.max())
+    mean = (w @ wander.LEVELS**2).sum() / w.sum()
+    assert one["beside"] == pytest.approx(1.5 * math.sqrt(mean))
+
+
+def test_what_vehicles_told_stays_when_they_leave_and_fades() -> None:
+    calm, lively = (
+        keep_lanes([std] * 4, 30.0, 3, beside_spread_all=0.5)[0] for std in (0.06, 0.25)
+    )
+    said = [t.filter["party"]["told"][:4].sum(axis=0) for t in (calm, lively)]
+    assert np.argmax(said[0]) < np.argmax(said[1])
+    new = []
+    for traffic, told in zip((calm, lively), said, strict=True):
+        T = traffic.filter
+        for _ in range(20):
+            traffic.nothing(speed=EGO_SPEED, yaw_rate=0.0)
+        assert not T["party"]["told"].any()
+        gone = T["gone"].copy()
+        np.testing.assert_allclose(gone, told, rtol=0.01, atol=0.05)
+        traffic.scan([9], [[30.0, 0.0]], speed=EGO_SPEED, yaw_rate=0.0, speeds=False)
+        new.append(float(T["party"]["beside"][0]))
+        np.testing.assert_allclose(T["gone"], math.exp(-0.1 / tr.GONE_S) * gone, rtol=1e-9)
+    assert new[0] < 0.8 * new[1]
 
 
 # ---- in traffic
