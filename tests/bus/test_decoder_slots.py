@@ -37,8 +37,10 @@ def test_sixteen_slots_in_any_order_are_a_scan(decoder, track):
     assert scan.counter == 200
     np.testing.assert_allclose(scan.z[:16], [[30.0, -1.5, -2.0, 0.0]] * 16)
     assert scan.valid[:16].tolist() == [[True, True, True, False]] * 16
-    # sideways .6 m, and .012 m per metre of the 30 m ahead
-    np.testing.assert_allclose(scan.std[:16, :3], [[0.25, 0.15, 0.2]] * 16, rtol=0.002)
+    # sideways to steps of .04 m, which is next to nothing
+    of_y = np.hypot(0.2, 0.04 / np.sqrt(12.0))
+    np.testing.assert_allclose(scan.std[:16, :3], [[0.25, 0.15, of_y]] * 16, rtol=0.002)
+    assert scan.lasting == (0.25, 0.4, 0.004, 1.0, 0.01, 1.0, 0.05)
 
 
 def test_empty_and_invalid_slots_are_no_objects(decoder, track):
