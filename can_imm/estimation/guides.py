@@ -41,6 +41,7 @@ from can_imm.estimation.traffic import (
     best_global,
     lane_at,
     measure_,
+    room,
     shares_,
 )
 from can_imm.estimation.wander import N_USUAL, NO_LANE, forget_wander_, learn_wander_
@@ -61,8 +62,9 @@ GATE = 25.0
 """Squared normalised error above which a vehicle is not where it was."""
 MAX_OUTLIERS = 4
 """After so many in a row it is another one."""
-FEW = 6
-"""Up to so many vehicles are followed as closely as can be."""
+FEW, MANY = 6, 18
+"""Up to so many vehicles are followed as closely as can be.  With more of them the courses of each
+begin more seldom, so that there are as many; with many, more seldom still: each costs more."""
 ANEW = 2.0
 """After so many times as long as lasting errors last, a measurement has another one."""
 CALM = 0.16
@@ -236,10 +238,10 @@ def meet_(
     It is in the lane that is nearest, in the next one, or between two.  Of a crowd some are only
     met in the next scans, when most of the others' courses are given up.
     """
-    g = 0
-    while g < N_GUIDES and T.party[g].slot != FREE:
+    g, end = 0, room(T)
+    while g < end and T.party[g].slot != FREE:
         g += 1
-    if g == N_GUIDES:
+    if g == end:
         return FREE
     # where the road leads, and so in which lane it is, each global hypothesis says for itself
     lane_row_(T.h, T.x[WAY], notes[s].x)
@@ -417,7 +419,8 @@ def watch_(
             if twin != FREE:
                 leave_(T, guide_of, g)
                 guide_of[s] = twin
-    apart = APART * max(1.0, (T.top - T.first) / float(T.stride * FEW))
+    crowd = (T.top - T.first) / float(T.stride * FEW)
+    apart = APART * max(1.0, crowd, crowd * crowd * FEW / MANY)
     nowhere = np.empty(0)
     new, n_new = np.empty(n, np.int64), 0
     for k in range(n):

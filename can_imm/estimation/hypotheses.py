@@ -224,7 +224,7 @@ def total_odds(T: Any, g: int, who: int) -> float:  # pragma: no cover - compile
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def settle_(T: Any, who: int, t: float, par: FloatArray) -> None:  # pragma: no cover - compiled
-    """A course that ended some time ago is one with the lane that it led to; in place."""
+    """A course that ended `P_SETTLE` seconds ago is one with the lane that it led to; in place."""
     ended, settle = T.party[who].ended, par[P_SETTLE]
     best, total = best_global(T), np.nan
     for q in range(T.n):

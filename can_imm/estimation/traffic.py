@@ -3,7 +3,10 @@
 A vehicle that begins to change lanes looks like a road that begins to bend, and an ego that changes
 lanes like all the others doing so.  So all are estimated at once.  The state is that of the road
 (`estimation.road`), and for each vehicle its place beside the course that it follows, and the rate
-of that place [m, m/s]: it wanders about its course (Matern covariance of order 3/2).
+of that place [m, m/s]: it wanders about its course (Matern covariance of order 3/2).  Where the
+sensor has errors that last for longer than a scan, these are states as well (as Bryson and
+Johansen, 1965, do with coloured noise): one of each vehicle's place, and one of the bearing that
+all share.
 
 A course leads along the middle of a lane, or from there to the middle of the next one.  Given
 everybody's course all is linear and Gaussian, and since a course only adds what is known to what is
@@ -69,8 +72,8 @@ BEARING = N_ROAD
 WITHOUT_ERROR, WITH_ERROR = 2, 3
 """States of a vehicle: its place beside its course and the rate; and the lasting error of where it
 is measured."""
-N = N_ROAD + 1 + WITH_ERROR * N_GUIDES
-"""Greatest length of the state."""
+N = N_ROAD + 1 + WITHOUT_ERROR * N_GUIDES
+"""Greatest length of the state.  With lasting errors it has room for fewer vehicles, `room`."""
 N_LOCAL = 6144
 """Most local hypotheses, of all parties together."""
 N_GLOBAL = 12
@@ -227,6 +230,12 @@ def expect_errors_(T: Any, errors: LastingErrors) -> None:
     T["bearing_std"], T["bearing_s"] = errors.bearing_std, errors.bearing_s
     T["new_std"], T["new_s"] = errors.new_std, errors.new_s
     T["P"][BEARING, BEARING] = errors.bearing_std**2
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def room(T: Any) -> int:  # pragma: no cover - compiled
+    """How many vehicles can be followed."""
+    return int(min((N - T.first) // T.stride, N_GUIDES))
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -25,6 +25,7 @@ from can_imm.types import FloatArray
 LEVELS = np.array([0.06, 0.1, 0.16, 0.25, 0.4, 0.6])
 """Standard deviations of places beside the middle of a lane that are told apart [m]."""
 N_LEVELS = len(LEVELS)
+_LOG_LEVELS = np.log(LEVELS)
 _USUAL = np.arange(-4.0, 4.5)
 N_USUAL = len(_USUAL)
 """So many medians of a drive's vehicles are told apart; how far the logarithm of each is from that
@@ -78,9 +79,11 @@ def weigh_levels_(
     apart = np.empty(N_LEVELS)
     for k in range(N_USUAL):
         usual = median + _USUAL[k] * par[P_BESIDE_SPREAD_ALL]
+        before = after = -np.inf
         for i in range(N_LEVELS):
-            apart[i] = -0.5 * ((math.log(LEVELS[i]) - usual) / par[P_BESIDE_SPREAD]) ** 2
-        before, after = apart.max(), (apart + one.evidence).max()
+            apart[i] = -0.5 * ((_LOG_LEVELS[i] - usual) / par[P_BESIDE_SPREAD]) ** 2
+            before = max(before, apart[i])
+            after = max(after, apart[i] + one.evidence[i])
         norm = likely = squares = 0.0
         for i in range(N_LEVELS):
             norm += math.exp(apart[i] - before)

@@ -117,6 +117,21 @@ def test_what_all_vehicles_seem_to_do_is_the_bearing() -> None:
     assert places[1] < 0.8 * places[0]
 
 
+def test_more_vehicles_than_can_be_followed() -> None:
+    """The nearest are; there is room for sixteen, as many as the radar has slots."""
+    traffic = Traffic(known_road())
+    n = 20
+    xy = np.column_stack((10.0 + 9.0 * np.arange(n), np.zeros(n)))
+    for _ in range(30):
+        traffic.scan(
+            range(n), xy, dt=DT, speed=SPEED, yaw_rate=0.0, std=STD, speeds=False, lasting=ERRORS
+        )
+    T = traffic.filter
+    assert sorted(T["party"]["slot"][T["party"]["slot"] >= 0].tolist()) == list(range(16))
+    assert T["top"] <= tr.N
+    assert np.isfinite(T["P"]).all()
+
+
 def test_after_a_long_silence_errors_last_as_before() -> None:
     traffic = Traffic(known_road())
     for dt in (DT, DT, 5.0, DT):
