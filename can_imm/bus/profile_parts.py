@@ -47,8 +47,8 @@ class Component:
     std_from: Code | None
     std_floor: float
     std_lasting: float = 0.0
-    std_per_m: float = 0.0
     lasting_s: float = 0.0
+    std_per_m: float = 0.0
     per_m_s: float = 0.0
     new_per_m: float = 0.0
     new_s: float = 0.0

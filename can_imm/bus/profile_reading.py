@@ -151,6 +151,10 @@ def _sign(table: Table) -> float:
     return sign
 
 
+_LASTING = ("std_lasting", "lasting_s"), ("std_per_m", "per_m_s"), ("new_per_m", "new_s")
+"""Keys of a component's lasting errors: how large they are, and for how long."""
+
+
 def read_component(table: Table, what: str, find: Callable[[str], Any], named: Codes) -> Component:
     """How the component ``what`` is measured.
 
@@ -169,29 +173,18 @@ def read_component(table: Table, what: str, find: Callable[[str], Any], named: C
         to_si(unit),
         std_from,
         table.number("std_floor", 0.0, low=0.0, high=_LARGEST),
-        table.number("std_lasting", 0.0, low=0.0, high=_LARGEST),
-        table.number("std_per_m", 0.0, low=0.0, high=_LARGEST),
-        table.number("lasting_s", 0.0, low=0.0, high=_LARGEST),
-        table.number("per_m_s", 0.0, low=0.0, high=_LARGEST),
-        table.number("new_per_m", 0.0, low=0.0, high=_LARGEST),
-        table.number("new_s", 0.0, low=0.0, high=_LARGEST),
+        **{
+            key: table.number(key, 0.0, low=0.0, high=_LARGEST) for pair in _LASTING for key in pair
+        },
     )
     table.done()
     if component.std_floor and std_from is None:
         raise table.error("'std_floor' is of use only with a 'std_signal'")
-    for key, value in (
-        ("std_lasting", component.std_lasting),
-        ("std_per_m", component.std_per_m),
-        ("lasting_s", component.lasting_s),
-        ("per_m_s", component.per_m_s),
-        ("new_per_m", component.new_per_m),
-        ("new_s", component.new_s),
-    ):
-        if value and what != "y":
-            raise table.error(f"'{key}' is for y: an error of the bearing")
-    for large, long in (
-        ("std_lasting", "lasting_s"), ("std_per_m", "per_m_s"), ("new_per_m", "new_s"),
-    ):  # fmt: skip
+    for pair in _LASTING:
+        for key in pair:
+            if getattr(component, key) and what != "y":
+                raise table.error(f"'{key}' is for y: an error of the bearing")
+    for large, long in _LASTING:
         if (getattr(component, large) > 0.0) != (getattr(component, long) > 0.0):
             raise table.error(f"'{large}' and '{long}' go together: how large, and for how long")
     return component

@@ -39,6 +39,7 @@ from can_imm.estimation.traffic import (
     N_PARTIES,
     WITH_ERROR,
     best_global,
+    first_state,
     lane_at,
     measure_,
     room,
@@ -264,7 +265,7 @@ def meet_(
     party = T.party[g]
     party.slot, party.unseen, party.outliers, party.since = s, 0.0, 0, t
     guide_of[s] = g
-    a = T.first + T.stride * g
+    a = first_state(T, g)
     T.top = max(T.top, a + T.stride)
     usual = np.empty(N_USUAL)
     listen_(T, usual)
@@ -309,7 +310,7 @@ def see_place_(
         if h[i] != 0.0:
             h[m], at[m] = h[i], i
             m += 1
-    a = T.first + T.stride * g
+    a = first_state(T, g)
     h[m], at[m] = 1.0, a
     m += 1
     if T.stride == WITH_ERROR:
@@ -346,7 +347,7 @@ def see_speed_(
         if v != 0.0:
             h[m], at[m] = v, i
             m += 1
-    h[m], at[m] = 1.0, T.first + T.stride * g + 1
+    h[m], at[m] = 1.0, first_state(T, g) + 1
     for q in range(T.n):
         if T.local[q].who == g:
             _, other, _ = lane_at(T.local[q], t)

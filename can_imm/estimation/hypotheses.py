@@ -20,6 +20,7 @@ from can_imm.estimation.traffic import (
     N_LOCAL,
     N_PARTIES,
     best_global,
+    first_state,
     global_weights_,
     shares_,
 )
@@ -465,8 +466,7 @@ def remove_guide_(T: Any, g: int) -> None:  # pragma: no cover - compiled
         T.party[g].told[k] = 0.0
     T.party[g].ended[:] = 0.0
     drop_locals_(T, g)
-    first = T.first + T.stride * g
-    for a in range(first, first + T.stride):
+    for a in range(first_state(T, g), first_state(T, g + 1)):
         T.x[a] = 0.0
         for q in range(T.n):
             T.mean[q, a] = 0.0
@@ -479,7 +479,7 @@ def remove_guide_(T: Any, g: int) -> None:  # pragma: no cover - compiled
     for k in range(N_PARTIES - 1):
         if T.party[k].slot != FREE:
             top = k + 1
-    T.top = T.first + T.stride * top
+    T.top = first_state(T, top)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -206,7 +206,8 @@ def begin_traffic_(T: Any, par: FloatArray, t: float, width: float, width_var: f
     T["x"][WIDTH], T["P"][WIDTH, WIDTH] = width, width_var
     T["first"] = T["top"] = N_ROAD
     T["stride"] = WITHOUT_ERROR
-    T["lasting_std"] = T["lasting_s"] = T["bearing_std"] = T["bearing_s"] = 0.0
+    for name in ("lasting_std", "lasting_s", "bearing_std", "bearing_s", "new_std", "new_s"):
+        T[name] = 0.0
     T["party"]["slot"] = FREE
     T["party"]["begun"][EGO] = t
     T["choice"][:] = FREE
@@ -236,6 +237,12 @@ def expect_errors_(T: Any, errors: LastingErrors) -> None:
 def room(T: Any) -> int:  # pragma: no cover - compiled
     """How many vehicles can be followed."""
     return int(min((N - T.first) // T.stride, N_GUIDES))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def first_state(T: Any, g: int) -> int:  # pragma: no cover - compiled
+    """Index of vehicle g's place; its rate follows, and its lasting error where there are such."""
+    return int(T.first + T.stride * g)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -435,12 +442,7 @@ def usual_curvature(T: Any, par: FloatArray) -> float:  # pragma: no cover - com
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def predict_traffic_(
-    T: Any,
-    par: FloatArray,
-    dt: float,
-    t: float,
-    speed: float,
-    yaw_rate: float,
+    T: Any, par: FloatArray, dt: float, t: float, speed: float, yaw_rate: float
 ) -> None:  # pragma: no cover - compiled
     """Move all on by ``dt`` seconds to time t [s], in place.
 
@@ -478,20 +480,21 @@ def predict_traffic_(
     P[HEADING, HEADING] += yaw**2 * dt
     P[OFFSET, OFFSET] += par[P_DRIFT] ** 2 * dt
     P[BIAS, BIAS] += par[P_BIAS_STD] ** 2 * (1.0 - F[BIAS, BIAS] ** 2)
+    come = 0.0
     if T.stride == WITH_ERROR:
         come = T.bearing_std**2 * (1.0 - math.exp(-2.0 * dt / T.bearing_s))
         forget_error_(T, BEARING, math.exp(-dt / T.bearing_s), come)
+        come = T.lasting_std**2 * (1.0 - math.exp(-2.0 * dt / T.lasting_s))
     hurry = par[P_BESIDE_RATE]
     f = fading(hurry, dt)
     for g in range(N_GUIDES):
         if T.party[g].slot == FREE:
             continue
-        a = T.first + T.stride * g
+        a = first_state(T, g)
         if T.stride == WITH_ERROR:
             lasts = T.lasting_s
             if t - T.party[g].since < NEW_TIMES * T.new_s:
                 lasts = T.new_s
-            come = T.lasting_std**2 * (1.0 - math.exp(-2.0 * dt / T.lasting_s))
             forget_error_(T, a + 2, math.exp(-dt / lasts), come)
         carry_guide_(x.reshape(1, N), 1, a, f)
         carry_guide_(T.mean, n, a, f)
@@ -519,8 +522,9 @@ def predict_traffic_(
         last = N_ROAD - 1
         P[last, last] += usual_curvature(T, par) ** 2 * (1.0 - memory**2)
     drive_(T, par, dt, t, v, yaw_rate if known else np.nan)
+    fade = math.exp(-dt / GONE_S)
     for k in range(N_USUAL):
-        T.gone[k] *= math.exp(-dt / GONE_S)
+        T.gone[k] *= fade
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
