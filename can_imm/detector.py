@@ -154,6 +154,7 @@ class Detector:
         self._age: IntArray = np.zeros(capacity, np.int32)
         self._outliers: IntArray = np.zeros(capacity, np.int32)
         self._measured = np.zeros(capacity, np.bool_)
+        self._nobody = np.zeros(capacity, np.bool_)
         # the free slots, and those set free in a step: by an id's reuse, a failure and by coasting
         self._free: IntArray = np.zeros(4 * capacity, np.int32)
         self._free[:capacity] = range(capacity - 1, -1, -1)
@@ -289,19 +290,21 @@ class Detector:
         Returns:
             The number of rows written, `n_tracked`.
         """
-        n = self._extrapolate(t_ns)
+        n = self._extrapolate(t_ns, self._nobody)
         if self._road is not None:
             self._road.globalise_(self.predicted, n)
         return n
 
-    def _extrapolate(self, t_ns: int) -> int:
-        """Like `predict`, in the axes of the road."""
+    def _extrapolate(self, t_ns: int, spared: BoolArray) -> int:
+        """Like `predict`, in the axes of the road; rows of slots (capacity,) that are spared stay
+        as they are."""
         return int(
             extrapolate_all_(
                 self._objects,
                 self._id,
                 self._age,
                 self._updated,
+                spared,
                 self.bank.record,
                 self._work,
                 t_ns,
@@ -404,7 +407,7 @@ class Detector:
         n: int = self._fill(*self._report_arguments(t_ns))
         coasting = self.reports["coasting"]
         if coasting[:n].any():
-            self._extrapolate(now * self._step_ns)
+            self._extrapolate(now * self._step_ns, self._measured)
             for k in np.flatnonzero(coasting[:n]):
                 self.reports[k] = self.predicted[k]
                 self.reports["t_ns"][k] = t_ns

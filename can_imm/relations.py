@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numba
@@ -38,6 +39,8 @@ AHEAD_M, BEHIND_M, FASTER = 40.0, 10.0, 0.5
 TWIN_M, TWIN_WIDTH_M, TWIN_SPEED = 3.0, 1.0, 1.0
 """No two vehicles are so near along and across the road [m] at the same speed [m/s]."""
 TWIN_SCANS = 3
+SUREST = 1.0 - 1e-9
+"""A greater probability counts as this one."""
 
 _LANE_CHANGE = int(Manoeuvre.LANE_CHANGE)
 _STATIONARY = int(Manoeuvre.STATIONARY)
@@ -50,11 +53,11 @@ def hesitate_(
 ) -> None:  # pragma: no cover - compiled
     """Say that a lane change has begun only when that is sure, in place.
 
-    Most of what is a lane change by a narrow margin and for a moment is a vehicle that wanders in
-    its lane.  So what its probability is above one half is summed up over the time, as in a
-    cumulative sum test (Page, 1954).  Until the sum is ``sure`` [s] the second most probable
-    manoeuvre is said; a lane change that was said stays until another manoeuvre is more probable.
-    Other arguments as for `relate_`.
+    Most of what is a lane change by a narrow margin or for a moment is none: a vehicle wanders in
+    its lane, or one measurement is far off.  So the logarithm of its odds is summed up over the
+    time, as in a cumulative sum test (Page, 1954).  Until the sum is ``sure`` [s] the second most
+    probable manoeuvre is said; a lane change that was said stays until another manoeuvre is more
+    probable.  Other arguments as for `relate_`.
     """
     k = 0
     for s in range(ids.shape[0]):
@@ -71,7 +74,8 @@ def hesitate_(
         if not changing or m.changing:
             m.belief = 0.0
         else:
-            m.belief = max(m.belief + (report.probability - 0.5) * dt, 0.0)
+            p = min(report.probability, SUREST)
+            m.belief = max(m.belief + math.log(p / (1.0 - p)) * dt, 0.0)
             if m.belief < sure:
                 changing = False
                 p = report.probability

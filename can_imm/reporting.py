@@ -178,6 +178,7 @@ def extrapolate_all_(
     ids: Any,
     age: Any,
     updated: Any,
+    spared: Any,
     bank: Any,
     work: Any,
     t_ns: int,
@@ -188,6 +189,7 @@ def extrapolate_all_(
 
     Args:
         updated: (capacity,) int64, step of the last measurement.
+        spared: (capacity,) bool, slots whose reports are left as they are.
     """
     n = 0
     longest = bank[0].Pi.shape[0] - 1
@@ -195,6 +197,9 @@ def extrapolate_all_(
         if ids[s] < 0:
             continue
         report = reports[n]
+        n += 1
+        if spared[s]:
+            continue
         w = work[0]
         steps = min(max(now - updated[s], 0), longest)
         extrapolate_(bank[0], objects[s], steps, w.tx, w.tP, w.w, w)
@@ -203,7 +208,6 @@ def extrapolate_all_(
         report.age = age[s]
         report.coasting = True
         conclude_(bank[0], objects[s].lane_width, w.w, w.tx, w.tP, objects[s].reached, report)
-        n += 1
     return n
 
 

@@ -309,6 +309,32 @@ def test_the_egos_lane_change_is_not_theirs(side: int, known: bool) -> None:
         ]
 
 
+@pytest.mark.parametrize("width", [3.3, 3.75])
+def test_a_broad_road_seen_from_its_edge(width: float) -> None:
+    """Lanes are wider or narrower than was thought: six lanes aside that is more than half of one.
+    Two vehicles in each of seven lanes wander, and so does the ego."""
+    rng = np.random.default_rng(3)
+    cars = {
+        n: (-(n // 2), rng.uniform(15.0, 110.0), rng.uniform(0.2, 0.4), rng.uniform(0.3, 0.8))
+        for n in range(14)
+    }
+
+    def aside(size: float, pace: float, t: float) -> tuple[float, float]:
+        return size * math.sin(pace * t + 9.0 * size), size * pace * math.cos(pace * t + 9.0 * size)
+
+    def vehicles(t: float) -> dict[int, Vehicle]:
+        ours, our_rate = aside(0.28, 0.42, t)
+        out = {}
+        for name, (number, x, size, pace) in cars.items():
+            place, rate = aside(size, pace, t)
+            out[name] = (x, 0.0, width * number + place - ours, rate - our_rate)
+        return out
+
+    _, said = play(vehicles, 200)
+    right = [reports[n]["lane"] == cars[n][0] for reports in said[20:] for n in reports]
+    assert np.mean(right) > 0.99
+
+
 # ---- many, twice, and rubbish
 
 

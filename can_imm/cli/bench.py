@@ -1,6 +1,6 @@
 """Measure this package beside its peers on this machine: the same work, in one run.
 
-  can-imm bench                                     estimator, decoder, replay of a simulated log
+  can-imm bench                                     estimator, decoder, replay of simulated logs
   can-imm bench --log drive.log --profile toyota    replay a log of your own
   can-imm bench --json bench.json                   and write the figures to a file
 
@@ -60,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
                 *bench.estimator_cases(),
                 bench.decode_case(),
                 *bench.replay_cases(log, profile, bank, share),
+                bench.crowd_case(Path(folder) / "crowd.log"),
             ]
             names = [case.name for case in cases]
             unknown = [name for name in args.only or [] if name not in names]

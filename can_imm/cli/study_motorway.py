@@ -176,6 +176,7 @@ _TABLES: dict[str, _Columns] = {
         "found": ("lane_changes_found", 3, None),
         "within\n100 m": ("lane_changes_found_nearby", 3, None),
         "delay\n[s]": ("lane_change_delay_s", 2, None),
+        "least\n[s]": ("lane_change_delay_limit_s", 2, None),
         "false\nper hour": ("false_lane_changes_per_hour", 1, None),
         "object\nhours": ("object_hours", 2, None),
     },

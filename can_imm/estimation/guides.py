@@ -52,9 +52,10 @@ SEEN_TO = 250.0
 """Vehicles further away [m] are not followed."""
 SEEN_FROM = -50.0
 """Nor are those further behind [m]."""
-WIDTH_SEEN_TO, WIDTH_LANES = 100.0, 2
-"""Vehicles that are further away [m], or in a lane further aside, do not tell how wide lanes are:
-their lane is not sure enough."""
+WIDTH_SEEN_TO, WIDTH_SURE = 100.0, 0.6
+"""Vehicles that are further away [m], or so far aside that the middle of their lane is not known
+better than that [m], do not tell how wide lanes are: their lane is not sure enough.  That the width
+may be wrong is an error of what they tell."""
 UNSEEN_S = 1.0
 """A vehicle that was not seen for longer is forgotten [s]."""
 OFF = 0.5
@@ -300,11 +301,13 @@ def see_place_(
     width = T.x[WIDTH]
     ours = T.choice[best_global(T), g]
     lane, _, _ = lane_at(T.local[ours], t)
-    if x < WIDTH_SEEN_TO and abs(lane) <= WIDTH_LANES:
+    off = lane**2 * T.P[WIDTH, WIDTH]
+    if x < WIDTH_SEEN_TO and off < WIDTH_SURE**2:
         h[WIDTH] = lane
     else:
         h[WIDTH] = 0.0
         y -= lane * width
+        noise += off
     m = 0
     for i in range(N_ROAD):
         if h[i] != 0.0:
@@ -421,7 +424,7 @@ def watch_(
                 leave_(T, guide_of, g)
                 guide_of[s] = twin
     crowd = (T.top - T.first) / float(T.stride * FEW)
-    apart = APART * max(1.0, crowd, crowd * crowd * FEW / MANY)
+    apart = APART * max(1.0, crowd, crowd * (crowd * FEW / MANY) ** 2)
     nowhere = np.empty(0)
     new, n_new = np.empty(n, np.int64), 0
     for k in range(n):

@@ -300,9 +300,11 @@ def measure_(
             gain[i] += w * P[c, i]
     for a in range(m):
         s += h[a] * gain[at[a]]
+    whose, others = np.empty(n, np.int32), np.empty(N_PARTIES)
     for q in range(n):
+        whose[q] = local[q].who
         error[q] = -seen(h, at, m, mean[q])
-        if local[q].who == who:
+        if whose[q] == who:
             error[q] -= T.shift[q]
     errors = np.empty(N_GLOBAL)
     least = np.inf
@@ -318,7 +320,7 @@ def measure_(
     if who != NOBODY:
         v = errors[best] - error[choice[best, who]]
         for q in range(n):
-            if local[q].who == who and odds[best, q] > -LIKELY:
+            if whose[q] == who and odds[best, q] > -LIKELY:
                 least = min(least, (v + error[q]) ** 2)
     if not (s > 0.0 and least <= gate * s):
         return False
@@ -326,8 +328,12 @@ def measure_(
     for g in range(n_global):
         lost = min(errors[g] ** 2 * precision, MOST_LOST)
         log_w[g] -= 0.5 * lost
+        for p in range(N_PARTIES):
+            others[p] = errors[g]
+            if choice[g, p] != FREE:
+                others[p] -= error[choice[g, p]]
         for q in range(n):
-            v = errors[g] - error[choice[g, local[q].who]] + error[q]
+            v = others[whose[q]] + error[q]
             v *= v * precision
             odds[g, q] -= 0.5 * ((v if v < MOST_LOST else MOST_LOST) - lost)
         v = -seen(h, at, m, rest[g]) * precision

@@ -142,6 +142,7 @@ class ObjectTruth:
         flags: (N,) bits `CUT_IN`, `CUT_OUT`, during such a lane change.
         speed: (N,) over ground along the road [m/s], negative against our direction.
         station, d: (N,) where on the road [m].
+        driver: its course.
     """
 
     object_id: int
@@ -155,6 +156,7 @@ class ObjectTruth:
     speed: FloatArray
     station: FloatArray
     d: FloatArray
+    driver: Driver
     dt_ns: int = DT_NS
 
     def sample(self, t_ns: int) -> int:
@@ -179,7 +181,7 @@ def drive(scenario: MotorwayScenario) -> MotorwayTruth:
     t = np.arange(n, dtype=np.float64) * _DT
     ego, ego_rate = _ego(scenario, t)
     objects: list[ObjectTruth] = []
-    traffic: list[tuple[Driver, ObjectTruth]] = []
+    traffic: list[ObjectTruth] = []
     for drivers, label in (
         (scenario.drivers, None),
         (scenario.oncoming, Manoeuvre.ONCOMING),
@@ -190,10 +192,9 @@ def drive(scenario: MotorwayScenario) -> MotorwayTruth:
             if truth is not None:
                 objects.append(truth)
                 if label is None:
-                    traffic.append((driver, truth))
-    for driver, truth in traffic:
-        others = [other for _, other in traffic if other is not truth]
-        _overtaking_flags(scenario, driver, truth, others)
+                    traffic.append(truth)
+    for truth in traffic:
+        _overtaking_flags(scenario, truth, [other for other in traffic if other is not truth])
     return MotorwayTruth(scenario, np.arange(n, dtype=np.int64) * DT_NS, ego, tuple(objects))
 
 
@@ -288,6 +289,7 @@ def _object(
         speed=np.copysign(np.hypot(vx, vy), v),
         station=s,
         d=d,
+        driver=driver,
     )
 
 
@@ -332,10 +334,10 @@ def _cut_flags(
 
 
 def _overtaking_flags(
-    scenario: MotorwayScenario, driver: Driver, truth: ObjectTruth, others: list[ObjectTruth]
+    scenario: MotorwayScenario, truth: ObjectTruth, others: list[ObjectTruth]
 ) -> None:
     """Set `OVERTAKING_ANOTHER` by the rule in the module's text."""
-    width = scenario.lane_width
+    width, driver = scenario.lane_width, truth.driver
     d = driver.d
     ends = [change.start for change in driver.changes[1:]] + [np.inf]
     for change, end in zip(driver.changes, ends[: len(driver.changes)], strict=True):

@@ -29,12 +29,13 @@ from can_imm.estimation import layout
 from can_imm.estimation.entry import Processor
 from can_imm.estimation.noise import noise_state
 from can_imm.estimation.particles import N_COLUMNS, N_SCRATCH
-from can_imm.manoeuvres import PRESETS, ModeBank, bank_from_dict
+from can_imm.manoeuvres import PRESETS, ModeBank, bank_from_dict, load_bank
 from can_imm.runtime.clock import FastClock
 from can_imm.runtime.feeds import LogFeed
 from can_imm.runtime.health import Health
 from can_imm.runtime.loop import Loop
 from can_imm.runtime.nodes import DetectorNode
+from can_imm.studies.crowd import OBJECTS, PROFILE, crowd
 from can_imm.studies.peer import imm_peer
 from can_imm.studies.runs import play
 from can_imm.types import FloatArray, IntArray, Scan
@@ -68,6 +69,18 @@ class Side:
 
 
 @dataclass(frozen=True)
+class RealTime:
+    """What is as fast as the bus: takes all of one core for as long as a log lasts [s]."""
+
+    duration: float
+    name: str = "a core in real time"
+
+    def seconds(self) -> float:
+        """As `Side.seconds`."""
+        return self.duration
+
+
+@dataclass(frozen=True)
 class Case:
     """A comparison.
 
@@ -82,7 +95,7 @@ class Case:
     name: str
     what: str
     ours: Side
-    peer: Side
+    peer: Side | RealTime
     faster: bool
     target: float | None
 
@@ -331,6 +344,37 @@ def _crowd(scans: int, objects: int) -> Iterator[Scan]:
         yield scan
 
 
+def crowd_case(log: Path, seconds: float = 20.0) -> Case:
+    """As many objects as an ARS408 sends, through the preset motorway.
+
+    Args:
+        log: where to write them, when they are needed.
+    """
+    replay = _replay(log, load_profile(PROFILE), load_bank("motorway"), OBJECTS)
+
+    def run() -> None:
+        if not log.exists():  # in the round that does not count
+            with LogSink(log) as sink:
+                for frame in crowd(seconds):
+                    sink.send(frame)
+        replay()
+
+    what = f"replay of {OBJECTS} objects at 14 Hz, preset motorway"
+    return Case("crowd", what, Side("can-imm", run, 1), RealTime(seconds), False, 0.1)
+
+
+def _replay(log: Path, profile: Profile, bank: ModeBank, capacity: int = 64) -> Callable[[], None]:
+    def replay() -> None:
+        health = Health()
+        decoder, encoder = ScanDecoder(profile, capacity), ManoeuvreEncoder()
+        node = DetectorNode(decoder, Detector(bank, capacity=capacity), encoder, health)
+        loop = Loop(LogFeed(LogSource(log), FastClock(), health, OUTPUT_IDS), node, health)
+        while loop.step():
+            pass
+
+    return replay
+
+
 def replay_cases(log: Path, profile: Profile, bank: ModeBank, share: float) -> list[Case]:
     """Replay of a log against python-can with cantools, and these with a filterpy IMM.
 
@@ -341,19 +385,11 @@ def replay_cases(log: Path, profile: Profile, bank: ModeBank, share: float) -> l
     part = max(int(n_frames * share), 1)
     reference = Reference(profile)
 
-    def replay() -> None:
-        health = Health()
-        decoder, encoder = ScanDecoder(profile), ManoeuvreEncoder()
-        node = DetectorNode(decoder, Detector(bank), encoder, health)
-        loop = Loop(LogFeed(LogSource(log), FastClock(), health, OUTPUT_IDS), node, health)
-        while loop.step():
-            pass
-
     def read() -> None:
         for _ in reference.read(log):
             pass
 
-    ours = Side("can-imm", replay, 1)
+    ours = Side("can-imm", _replay(log, profile, bank), 1)
     tracker = "python-can, cantools, filterpy"
     if part < n_frames:
         tracker += f" ({part:,} of {n_frames:,} frames, scaled)"

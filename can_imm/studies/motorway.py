@@ -25,6 +25,7 @@ from can_imm.smoothing import FixedIntervalSmoother
 from can_imm.studies.metrics import summarise
 from can_imm.studies.montecarlo import map_jobs
 from can_imm.studies.motorway_filter import bent, curvature_of, follow, frames_of, level
+from can_imm.studies.motorway_limit import least_delays
 from can_imm.studies.motorway_metrics import Said, Score, ratio, score
 from can_imm.studies.motorway_rules import Rules, judge
 from can_imm.studies.motorway_rules import rules_for as tuned_rules
@@ -40,11 +41,17 @@ TRUTH = "motorway"
 
 @dataclass(frozen=True)
 class Result:
-    """One system on one profile: the score of every run in which a vehicle was seen."""
+    """One system on one profile.
+
+    Attributes:
+        scores: of every run in which a vehicle was seen.
+        least_delays_s: per run, see `motorway_limit`; the same for all systems.
+    """
 
     system: str
     profile: str
     scores: list[Score]
+    least_delays_s: list[tuple[float, ...]]
 
 
 def rules_say(run: MotorwayRun, rules: Rules) -> Said:
@@ -112,8 +119,8 @@ def _scores(
     systems: Sequence[str],
     preset: str,
     job: tuple[str, int],
-) -> list[Score | None]:
-    """All systems on one run."""
+) -> tuple[list[Score | None], tuple[float, ...]]:
+    """The scores of all systems on one run, and the least delays."""
     profile, seed = job
     run = play_motorway(profile, seed, settings)
     said: dict[str, Said] = {}
@@ -121,7 +128,8 @@ def _scores(
         said["motorway"], said["motorway-smoothed"] = detector_says(run, _modes(preset, kind), seed)
     if RULES in systems:
         said[RULES] = rules_say(run, tuned_rules(profile_name(profile), kind))
-    return [score(run, said[system]) for system in systems]
+    least = least_delays(run, radar_model(profile_name(profile)), settings)
+    return [score(run, said[system]) for system in systems], least
 
 
 def _modes(preset: str, kind: str) -> ModeBank:
@@ -168,9 +176,10 @@ def study(
     _modes(preset, kind)
     work = partial(_scores, KINDS[kind](settings), kind, systems, preset)
     todo = [(profile, seed + k) for profile in profiles for k in range(runs)]
-    results = {(s, p): Result(s, p, []) for p in profiles for s in systems}
-    for (profile, _), scores in zip(todo, map_jobs(work, todo, jobs), strict=True):
+    results = {(s, p): Result(s, p, [], []) for p in profiles for s in systems}
+    for (profile, _), (scores, least) in zip(todo, map_jobs(work, todo, jobs), strict=True):
         for system, one in zip(systems, scores, strict=True):
+            results[system, profile].least_delays_s.append(least)
             if one is not None:
                 results[system, profile].scores.append(one)
         progress()
@@ -182,6 +191,7 @@ def to_json(runs: int, seed: int, results: Sequence[Result]) -> dict[str, Any]:
 
     As `paper.to_json`: means over runs, with standard errors under ``"se"``.  What counts lane
     changes, lanes, objects and hours is a quotient of sums over all runs.
+    ``"lane_change_delay_limit_s"`` is what no detector can undercut, see `motorway_limit`.
     """
     rules = {result.profile: result for result in results if result.system == RULES}
     return {
@@ -198,7 +208,9 @@ def _result(result: Result, rules: Result | None) -> dict[str, Any]:
         return fields
     summary = summarise([one.metrics for one in scores])
     mean, error = (metric_fields({k: v[i] for k, v in summary.items()}) for i in (0, 1))
-    for name, (value, std) in _quotients(scores, rules).items():
+    least = [sum(run) for run in result.least_delays_s], [len(run) for run in result.least_delays_s]
+    quotients = {**_quotients(scores, rules), "lane_change_delay_limit_s": ratio(*least)}
+    for name, (value, std) in quotients.items():
         mean[name], error[name] = _known(value), _known(std)
     mean["lane_changes"] = sum(one.changes for one in scores)
     mean["object_hours"] = round(sum(one.hours for one in scores), 4)

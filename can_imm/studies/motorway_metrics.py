@@ -120,6 +120,15 @@ def _metrics(run: MotorwayRun, said: Said, tracks: Sequence[Int64Array]) -> Metr
     )
 
 
+def lane_changes(run: MotorwayRun, track: Int64Array) -> Iterator[tuple[int, int]]:
+    """Index in a track of the first frame of each true lane change that counts, and of the one
+    after its last."""
+    t_ns = run.t_ns[track]
+    for begin, end in _stretches(run.direction[track]):
+        if t_ns[end - 1] - t_ns[begin] >= SEEN_NS:
+            yield begin, end
+
+
 class _Events:
     """Counts lane changes."""
 
@@ -134,9 +143,7 @@ class _Events:
         manoeuvre, direction = said.manoeuvre[track], said.direction[track]
         self.hours += float(t_ns[-1] - t_ns[0]) * 1e-9 / 3600.0
         changing = manoeuvre == Manoeuvre.LANE_CHANGE
-        for begin, end in _stretches(true):
-            if t_ns[end - 1] - t_ns[begin] < SEEN_NS:
-                continue
+        for begin, end in lane_changes(run, track):
             is_nearby = bool(run.state[track[begin], X] <= NEARBY)
             self.changes += 1
             self.nearby += is_nearby

@@ -169,6 +169,35 @@ def test_what_is_seen_of_a_vehicle_is_seen_of_the_road(what: str, seed: int) -> 
     np.testing.assert_allclose(T["P"][:top, :top], expected, rtol=1e-8, atol=1e-8)
 
 
+@settings(max_examples=15)
+@given(SEEDS)
+def test_far_ahead_the_width_of_lanes_is_a_source_of_error(seed: int) -> None:
+    """What is seen there says as much of the road as if the width were estimated along, and
+    nothing of the width."""
+    T, rng = one_guide(seed)
+    top, a = int(T["top"]), N_ROAD + 4
+    rest = np.arange(top) != WIDTH
+    for matrix in (T["P"], T["P"].T):
+        matrix[WIDTH, :top] *= ~rest
+    x, P = T["x"][:top].copy(), T["P"][:top, :top].copy()
+    ahead, noise = guides.WIDTH_SEEN_TO + 5.0, 0.3
+    h = np.zeros(N_ROAD + 1)
+    lane_row_(h, x[WAY], ahead)
+    H = np.zeros(top)
+    H[:N_ROAD] = h[:N_ROAD]
+    H[WIDTH], H[a] = 1.0, 1.0
+    S = H @ P @ H + noise
+    z = H @ x + rng.normal() * math.sqrt(S)
+    assert guides.see_place_(T, 2, ahead, z, noise, 0.3)
+    gain = P @ H / S
+    moved, cov = x + gain * (z - H @ x), P - np.outer(gain, gain) * S
+    np.testing.assert_allclose(T["x"][:top][rest], moved[rest], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        T["P"][:top, :top][np.ix_(rest, rest)], cov[np.ix_(rest, rest)], rtol=1e-8, atol=1e-8
+    )
+    assert (T["x"][WIDTH], T["P"][WIDTH, WIDTH]) == (x[WIDTH], P[WIDTH, WIDTH])
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_who_can_not_be_there_is_not_taken_in(seed: int) -> None:
     T, _ = one_guide(seed)

@@ -7,10 +7,12 @@ import json
 import numpy as np
 import pytest
 
+from can_imm.bus.decoder import ScanDecoder
 from can_imm.bus.profile import load_profile
 from can_imm.cli.main import main
 from can_imm.manoeuvres import load_bank
 from can_imm.studies import bench, peer
+from can_imm.studies.crowd import crowd
 from can_imm.studies.runs import play
 
 
@@ -143,6 +145,46 @@ def test_all_names_are_there(tmp_path):
     scaled = cases[-1].peer
     assert scaled.units == pytest.approx(0.5, abs=0.1)
     assert "scaled" in scaled.name
+
+
+def test_a_crowd_is_as_many_objects_as_the_radar_sends():
+    """In all scans; vehicles are those of the simulation, and posts stand still beside the road."""
+    profile = load_profile("ars408")
+    decoder = ScanDecoder(profile, 128)
+    scans, posts = 0, {}
+    for frame in crowd(2.0):
+        scan = decoder.feed(frame)
+        if scan is None:
+            continue
+        scans += 1
+        assert scan.n == 100
+        assert len(set(scan.ids[:100].tolist())) == 100
+        assert np.isfinite(scan.ego_speed)
+        still = np.abs(scan.z[:100, 1] + scan.ego_speed) < 0.5
+        assert 60 <= np.count_nonzero(still) < 95
+        for name, (x, _, y, _) in zip(
+            scan.ids[:100][still].tolist(), scan.z[:100][still].tolist(), strict=True
+        ):
+            posts.setdefault(name, []).append((x + scan.ego_speed * scan.t_ns * 1e-9, y))
+    assert scans >= 27
+    assert decoder.counts.rejected == decoder.counts.incomplete_scans == 0
+    seen_long = [np.array(places) for places in posts.values() if len(places) > 20]
+    assert len(seen_long) > 40
+    for places in seen_long:
+        assert np.ptp(places[:, 0]) < 1.0
+        assert np.ptp(places[:, 1]) < 0.3
+
+
+def test_the_share_of_a_core(tmp_path):
+    """The log is written when it is needed, and its time is that of the bus."""
+    log = tmp_path / "crowd.log"
+    case = bench.crowd_case(log, seconds=2.0)
+    assert not log.exists()
+    (result,) = bench.measure([case], 1)
+    assert log.exists()
+    assert result.peer_median_us == pytest.approx(2e6)
+    assert 0.005 < result.ratio < 2.0
+    assert not case.faster
 
 
 def test_unknown_comparison_is_refused(capsys):

@@ -51,6 +51,7 @@ def drive_of(*tracks):
                 speed=np.zeros(n),
                 station=np.zeros(n),
                 d=np.zeros(n),
+                driver=None,
                 **long,
             )
         )

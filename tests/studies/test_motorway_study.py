@@ -35,6 +35,7 @@ QUOTIENTS = {
     "lane_changes_found_nearby",
     "false_lane_changes_per_hour",
     "lane_change_delay_s",
+    "lane_change_delay_limit_s",
     "lane_accuracy",
     "stationary_share",
     "oncoming_share",
