@@ -172,13 +172,13 @@ _TABLES: dict[str, _Columns] = {
         "lane": ("lane_accuracy", 4, None),
     },
     "Lane changes": {
-        "lane\nchanges": ("lane_changes", 0, None),
+        "all": ("lane_changes", 0, None),
         "found": ("lane_changes_found", 3, None),
         "within\n100 m": ("lane_changes_found_nearby", 3, None),
         "delay\n[s]": ("lane_change_delay_s", 2, None),
         "least\n[s]": ("lane_change_delay_limit_s", 2, None),
-        "false\nper hour": ("false_lane_changes_per_hour", 1, None),
-        "object\nhours": ("object_hours", 2, None),
+        "false\nper h": ("false_lane_changes_per_hour", 1, None),
+        "hours": ("object_hours", 2, None),
     },
     "Found of what is not traffic in our direction": {
         "stationary": ("stationary_share", 4, None),

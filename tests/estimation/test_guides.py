@@ -133,7 +133,9 @@ def one_guide(seed: int) -> tuple[Any, np.random.Generator]:
     assert T["party"]["slot"][2] == 0
     x = 0.01 * rng.normal(size=top)
     x[WIDTH], x[WAY] = 3.4, 11.0
-    T["x"][:top], T["P"][:top, :top] = x, random_covariance(rng, top)
+    P = random_covariance(rng, top)
+    P *= min(1.0, 0.9 * guides.WIDTH_SURE**2 / P[WIDTH, WIDTH])
+    T["x"][:top], T["P"][:top, :top] = x, P
     T["mean"][: T["n"]], T["rest"][0] = 0.0, 0.0
     return T, rng
 
@@ -172,8 +174,7 @@ def test_what_is_seen_of_a_vehicle_is_seen_of_the_road(what: str, seed: int) -> 
 @settings(max_examples=15)
 @given(SEEDS)
 def test_far_ahead_the_width_of_lanes_is_a_source_of_error(seed: int) -> None:
-    """What is seen there says as much of the road as if the width were estimated along, and
-    nothing of the width."""
+    """What is seen there says as much of the rest of the road as if it told of the width, too."""
     T, rng = one_guide(seed)
     top, a = int(T["top"]), N_ROAD + 4
     rest = np.arange(top) != WIDTH
