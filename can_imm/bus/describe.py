@@ -216,12 +216,14 @@ def _component(profile: Profile, name: str, part: Component) -> tuple[str, str]:
     if part.std_from is not None:
         line += f", or that of {part.std_from.signal}"
         line += f", at least {part.std_floor:g}" if part.std_floor else ""
-    if part.std_lasting:
-        line += f"; an error of {part.std_lasting:g} that lasts {part.lasting_s:g} s"
-    if part.new_per_m:
-        line += f"; of {part.new_per_m:g} per metre ahead in new tracks, {part.new_s:g} s"
-    if part.std_per_m:
-        line += f"; of {part.std_per_m:g} per metre that all share, {part.per_m_s:g} s"
+    lasting = (
+        (part.std_lasting, "", part.lasting_s),
+        (part.new_per_m, " per metre ahead in a new track", part.new_s),
+        (part.std_per_m, " per metre ahead in all tracks alike", part.per_m_s),
+    )
+    errors = [f"{size:g} {unit}{where} for {time:g} s" for size, where, time in lasting if size]
+    if errors:
+        line += "; errors that last: " + ", ".join(errors)
     if scaling.missing is not None:
         line += f"; raw {scaling.missing}: not available"
     texts = []

@@ -222,12 +222,14 @@ def test_profiles_check_tells_of_errors_that_last(tmp_path):
         return line
 
     assert of_y(load_profile("toyota")).endswith(
-        "; an error of 0.25 that lasts 0.4 s; of 0.01 per metre ahead in new tracks, 1 s; "
-        "of 0.004 per metre that all share, 1 s"
+        "; errors that last: 0.25 m for 0.4 s, 0.01 m per metre ahead in a new track for 1 s, "
+        "0.004 m per metre ahead in all tracks alike for 1 s"
     )
     assert "per metre" not in of_y(load_profile("can_imm"))
     changed = profile_with(tmp_path, "can_imm", OWN_Y, OWN_Y + ", std_per_m = 0.02, per_m_s = 3")
-    assert "(0.2 and rounding); of 0.02 per metre that all share, 3 s" in of_y(changed)
+    assert of_y(changed).endswith(
+        "(0.2 and rounding); errors that last: 0.02 m per metre ahead in all tracks alike for 3 s"
+    )
 
 
 @pytest.mark.parametrize("name", ["ars999", "", "none.toml", "sub/none"])
