@@ -51,7 +51,7 @@ LEAST_STEP = 1.0
 """Points of the road's line are so far apart [m]."""
 AHEAD: FloatArray = np.arange(4.0, 304.0, 4.0)
 """Beyond the ego's last place the line goes on for so long [m]."""
-AHEAD_COV: FloatArray = np.diag(np.square([0.002, 3e-4, 1.5e-6]))
+AHEAD_STDS = 0.002, 3e-4, 1.5e-6
 """How wrong the filter may be about the road ahead: direction [rad], curvature [1/m], and the
 change of that [1/m²]."""
 AHEAD_STEP_S = 0.5
@@ -63,6 +63,17 @@ AHEAD_STD = 0.25
 def ahead_rows(distance: FloatArray) -> FloatArray:
     """Rows (K, 3): place of the road at a distance ahead [m] by its direction and curvature."""
     return np.stack([distance, distance**2 / 2.0, distance**3 / 6.0], axis=1)
+
+
+def ahead_cov(bends: float) -> FloatArray:
+    """Covariance (3, 3) of what the filter has wrong about the road ahead, see `AHEAD_STDS`.
+
+    Args:
+        bends: standard deviation of the road's curvature [1/m]; less is wrong of a straight one.
+    """
+    direction, curvature, change = AHEAD_STDS
+    share = min(bends / curvature, 1.0)
+    return np.diag(np.square([direction, share * curvature, share * change]))
 
 
 class RoadAtTheTime:
@@ -170,7 +181,7 @@ class RoadDriven:
 
 
 def learn_ahead(
-    distances: Sequence[FloatArray], places: Sequence[FloatArray]
+    distances: Sequence[FloatArray], places: Sequence[FloatArray], cov: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """What is wrong about the road ahead, by the vehicles that drive there.
 
@@ -190,15 +201,15 @@ def learn_ahead(
     design = np.concatenate((ahead_rows(np.concatenate(distances)), own), axis=1)
     y = np.concatenate(places)
     prior = np.zeros((3 + n, 3 + n))
-    prior[:3, :3] = np.linalg.inv(AHEAD_COV)
+    prior[:3, :3] = np.linalg.inv(cov)
     x = np.zeros(3 + n)
     x[3:] = [np.median(one) for one in places]
     for _ in range(10):
         weight = 1.0 / (1.0 + np.square((y - design @ x) / AHEAD_STD))
         weighted = design.T * weight / AHEAD_STD**2
-        cov: FloatArray = np.asarray(np.linalg.inv(weighted @ design + prior), np.float64)
-        x = cov @ weighted @ y
-    return x[:3], cov[:3, :3]
+        left: FloatArray = np.asarray(np.linalg.inv(weighted @ design + prior), np.float64)
+        x = left @ weighted @ y
+    return x[:3], left[:3, :3]
 
 
 class EgoHistory:

@@ -17,17 +17,17 @@ import numpy as np
 import numpy.typing as npt
 
 from can_imm.ego_road import (
-    AHEAD_COV,
     AHEAD_STEP_S,
     Ego,
     EgoHistory,
     RoadAtTheTime,
     RoadDriven,
+    ahead_cov,
     learn_ahead,
 )
 from can_imm.estimation.lane_changes import find_lane_changes_
 from can_imm.estimation.noise import noise_state
-from can_imm.estimation.road import WIDTH
+from can_imm.estimation.road import P_CURVATURE_STD, WIDTH
 from can_imm.estimation.speed_paths import draw_speeds_, judge_speeds_
 from can_imm.reporting import decide_, rear_end_share
 from can_imm.road import RoadFrame
@@ -89,15 +89,17 @@ class Hindsight:
 
     Args:
         bank: (1,) record of `layout.BANK_DTYPE`.
+        road: `estimation.road.PARAMETERS`.
     """
 
-    def __init__(self, bank: Any) -> None:
+    def __init__(self, bank: Any, road: FloatArray) -> None:
         self._bank = bank
         self._step_s = float(bank["step_s"][0])
         self._ego = EgoHistory()
         self._noise = noise_state(np.random.default_rng(0))
+        self._ahead_cov = ahead_cov(float(road[P_CURVATURE_STD]))
         self._ahead_of = 0
-        self._ahead: tuple[FloatArray, FloatArray] = np.zeros(3), AHEAD_COV
+        self._ahead: tuple[FloatArray, FloatArray] = np.zeros(3), self._ahead_cov
 
     def add(self, now: int, frame: RoadFrame, shift: float) -> int:
         """Remember a scan, and return its number; see `EgoHistory.add`."""
@@ -181,7 +183,7 @@ class Hindsight:
             distances.append(np.bincount(bins, beyond) / count)
             places.append(np.bincount(bins, place[:, Y]) / count)
         if places:
-            self._ahead_of, self._ahead = end, learn_ahead(distances, places)
+            self._ahead_of, self._ahead = end, learn_ahead(distances, places, self._ahead_cov)
 
     def _road(self, begin: int, ego: Ego, speed: FloatArray) -> RoadDriven | RoadAtTheTime:
         """The road of the scans from number ``begin`` on."""
@@ -189,7 +191,7 @@ class Hindsight:
             return RoadAtTheTime(ego, speed)
         if begin + len(ego) == self._ahead_of:
             return RoadDriven(ego, speed, *self._ahead)
-        return RoadDriven(ego, speed, np.zeros(3), AHEAD_COV)
+        return RoadDriven(ego, speed, np.zeros(3), self._ahead_cov)
 
     def _ego_speeds(self, ego: Ego) -> tuple[FloatArray, FloatArray]:
         """Paths of the ego's speed and its rate, (K, N); 0 if nothing is known of it."""

@@ -260,7 +260,7 @@ class FixedIntervalSmoother(_Smoother):
     def __init__(self, bank: ModeBank) -> None:
         super().__init__(bank)
         if bank.road is not None:
-            self._hindsight = Hindsight(bank.record)
+            self._hindsight = Hindsight(bank.record, bank.road)
         self._now = 0
         self._look_ahead = int(LOOK_AHEAD_S * 1e9) // bank.step_ns
         self._ended: deque[tuple[int, _Track]] = deque()

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from can_imm.detector import Detector
-from can_imm.ego_road import BESIDE, DRIFT, EgoHistory, RoadAtTheTime, RoadDriven, learn_ahead
+from can_imm.ego_road import (
+    BESIDE,
+    DRIFT,
+    EgoHistory,
+    RoadAtTheTime,
+    RoadDriven,
+    ahead_cov,
+    learn_ahead,
+)
 from can_imm.estimation.road import BIAS, HEADING, KNOT, MOUNTING, OFFSET, WIDTH
 from can_imm.manoeuvres import load_bank
 from can_imm.road import RoadFrame
@@ -114,12 +122,24 @@ def test_what_most_vehicles_do_the_road_does() -> None:
         for one, lane in zip(distances, (0, 1, -1, 0, 1), strict=True)
     ]
     places[3] = places[3] + LANE / (1.0 + np.exp(-np.linspace(-6.0, 6.0, 20)))
-    x, cov = learn_ahead(distances, places)
+    x, cov = learn_ahead(distances, places, ahead_cov(1e-3))
     for far in (40.0, 80.0, 110.0):
         row = np.array([far, far**2 / 2.0, far**3 / 6.0])
         error = row @ x - 1e-4 * far**2 / 2.0
         assert abs(error) < 0.15
         assert abs(error) < 3.0 * math.sqrt(row @ cov @ row)
+
+
+def test_a_straight_road_does_not_bend_for_who_changes_lanes() -> None:
+    """One vehicle far ahead moves to the next lane.  What may be a bend elsewhere is none there."""
+    far = np.linspace(60.0, 120.0, 20)
+    moved = LANE / (1.0 + np.exp(-np.linspace(-3.0, 3.0, 20)))
+    row = np.array([120.0, 120.0**2 / 2.0, 120.0**3 / 6.0])
+    bent, _ = learn_ahead([far], [moved], ahead_cov(4.5e-4))
+    straight, cov = learn_ahead([far], [moved], ahead_cov(1e-6))
+    assert abs(row @ bent) > 0.5
+    assert abs(row @ straight) < 0.3
+    np.testing.assert_allclose(np.sqrt(np.diag(cov))[1:], [1e-6, 5e-9], rtol=1e-3)
 
 
 def test_journeys_and_what_is_forgotten() -> None:
