@@ -10,7 +10,7 @@ import numpy as np
 from can_imm.bus.frame import Frame
 from can_imm.bus.profile import load_profile
 from can_imm.bus.radar_encoder import ProfileEncoder
-from can_imm.sim.motorway import REPORTING, drive, plain, random_motorway
+from can_imm.sim.motorway import DT_NS, REPORTING, drive, plain, random_motorway
 from can_imm.sim.radar import ego_messages, observe, radar_model
 from can_imm.types import VX, VY, Scan, X, Y
 
@@ -42,7 +42,7 @@ def crowd(seconds: float) -> Iterator[Frame]:
         while ego and ego[0][0] <= scan.t_ns:
             t_ns, speed, yaw_rate = ego.pop(0)
             yield from encoder.encode_ego(speed, yaw_rate, t_ns)
-        sample = scan.t_ns // truth.objects[0].dt_ns
+        sample = scan.t_ns // DT_NS
         whole = _with_posts(scan, float(truth.ego.station[sample]), float(truth.ego.speed[sample]))
         yield from encoder.encode(whole, whole.t_ns)
 
@@ -50,11 +50,8 @@ def crowd(seconds: float) -> Iterator[Frame]:
 def _with_posts(scan: Scan, station: float, speed: float) -> Scan:
     """The scan and the nearest posts, so that there are `OBJECTS`."""
     whole = Scan(OBJECTS)
-    n = whole.n = scan.n
-    for name in ("ids", "new", "z", "std", "valid", "angle"):
-        getattr(whole, name)[:n] = getattr(scan, name)[:n]
-    whole.t_ns, whole.counter = scan.t_ns, scan.counter
-    whole.ego_speed, whole.ego_yaw_rate = scan.ego_speed, scan.ego_yaw_rate
+    whole.copy_from(scan)
+    n = scan.n
     post = int(np.ceil(station / _SPACING)) + 1 + np.arange(OBJECTS - n) // 2
     side = np.arange(OBJECTS - n) % 2
     whole.n = OBJECTS

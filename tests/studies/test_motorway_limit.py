@@ -103,14 +103,14 @@ def test_errors_are_those_of_the_radar(profile):
             t = run.t_ns[track] * 1e-9
             x, y = run.state[track][:, [0, 2]].T
             error = (z[track] - run.state[track])[:, 2]
-            for first in range(0, len(track) - 30, 60):
+            for first in range(0, len(track) - 30, 10):
                 part = slice(first, first + 30, 6)
                 expected = error_covariance(t[part], x[part], y[part], radar, settings.noise)
                 products.append((np.outer(error[part], error[part]), expected[::2, ::2]))
     found, expected = np.mean(products, axis=0)
     # quantisation comes on top
     found -= np.eye(5) * {"ars408": 0.2, "toyota": 0.04}[profile] ** 2 / 12.0
-    np.testing.assert_allclose(found, expected, atol=0.25 * expected.max())
+    np.testing.assert_allclose(found, expected, atol=0.2 * expected.max())
 
 
 def test_a_polar_radar_sees_speeds_across_beside_it():
@@ -137,7 +137,7 @@ def test_a_polar_radar_sees_speeds_across_beside_it():
     )
 
 
-def test_more_noise_and_wander_take_longer():
+def test_more_noise_takes_longer():
     settings = published(REPORTING)
     run = play_motorway("ars408", 2001, settings)
     radar = RADARS["ars408"]
