@@ -10,6 +10,7 @@ import numpy as np
 
 from can_imm.estimation.lane_changes import SPREAD, STEADY_TIME, USUAL, add_logs
 from can_imm.estimation.road import (
+    N_ROAD,
     P_CHANGE_RATE,
     P_CHANGE_STEADY,
     P_SETTLE,
@@ -66,6 +67,10 @@ SAME = 1e-6
 """What is likelier by no more is as likely: rounding decides nothing."""
 SPLITS = 3
 """Most global hypotheses that are made at a time."""
+ANYBODY = -1
+"""The courses of all parties count."""
+OTHER_ROAD = 0.5
+"""Roads that are further apart than so many standard deviations are told apart."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -291,6 +296,25 @@ def alike(T: Any, p: int, q: int) -> bool:  # pragma: no cover - compiled
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def beyond(T: Any, g: int, i: int) -> float:  # pragma: no cover - compiled
+    """By how much state i of global hypothesis g is more than ``x``."""
+    v = T.rest[g, i]
+    for p in range(N_PARTIES):
+        if T.choice[g, p] != FREE:
+            v += T.mean[T.choice[g, p], i]
+    return float(v)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def same_road(T: Any, g: int, other: int) -> bool:  # pragma: no cover - compiled
+    """Whether two global hypotheses are of the same road, by what is known of it."""
+    for i in range(N_ROAD):
+        if abs(beyond(T, g, i) - beyond(T, other, i)) > OTHER_ROAD * math.sqrt(T.P[i, i]):
+            return False
+    return True
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def agree(T: Any, g: int, other: int, but: int) -> bool:  # pragma: no cover - compiled
     """Whether two global hypotheses have courses alike for all parties but one (-1: for all)."""
     for p in range(N_PARTIES):
@@ -311,20 +335,33 @@ def find_global(T: Any, g: int, who: int, q: int) -> int:  # pragma: no cover - 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def split_(T: Any) -> None:  # pragma: no cover - compiled
     """Make the likeliest alternatives global hypotheses of their own; in place."""
-    n_before = T.n_global
-    for g in range(n_before):
+    for g in range(T.n_global):
         for q in range(T.n):
             who = T.local[q].who
             if T.odds[g, q] > BETTER and alike(T, T.choice[g, who], q):
                 rechoose_(T, g, who, q)
+    promote_(T, SPLIT, ANYBODY)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def promote_(T: Any, least: float, of: int) -> None:  # pragma: no cover - compiled
+    """Make the likeliest alternatives to the courses that are chosen global hypotheses; in place.
+
+    Args:
+        least: those that make a global hypothesis less likely than the best by more are left.
+        of: party whose courses count, or `ANYBODY`.
+    """
+    n_before = T.n_global
     for _ in range(SPLITS):
         best = T.log_w[best_global(T)]
-        value, g, q = best - SPLIT, -1, -1
+        value, g, q = best - least, -1, -1
         for one in range(n_before):
             for p in range(T.n):
                 v = T.log_w[one] + T.odds[one, p]
                 who = T.local[p].who
-                if v <= value + SAME or alike(T, T.choice[one, who], p):
+                if v <= value + SAME or (of != ANYBODY and who != of):
+                    continue
+                if alike(T, T.choice[one, who], p):
                     continue
                 if find_global(T, one, who, p) < 0:
                     value, g, q = v, one, p
@@ -355,7 +392,7 @@ def drop_globals_(T: Any) -> None:  # pragma: no cover - compiled
         keep = T.log_w[g] >= -LATE
         other = 0
         while keep and other < kept:
-            if agree(T, g, other, -1):
+            if agree(T, g, other, -1) and same_road(T, g, other):
                 keep = False
                 if T.log_w[g] > T.log_w[other] + SAME:
                     copy_global_(T, g, other)
@@ -421,16 +458,6 @@ def drop_locals_(T: Any, gone: int) -> None:  # pragma: no cover - compiled
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def beyond(T: Any, g: int, i: int) -> float:  # pragma: no cover - compiled
-    """By how much state i of global hypothesis g is more than ``x``."""
-    v = T.rest[g, i]
-    for p in range(N_PARTIES):
-        if T.choice[g, p] != FREE:
-            v += T.mean[T.choice[g, p], i]
-    return float(v)
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
 def centre_(T: Any) -> None:  # pragma: no cover - compiled
     """Let ``x`` be the mean of the likeliest global hypothesis, and the others count from it; in
     place.
@@ -458,6 +485,23 @@ def consider_(T: Any, t: float, par: FloatArray) -> None:  # pragma: no cover - 
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def part_(T: Any, who: int) -> None:  # pragma: no cover - compiled
+    """What a party that leaves may have done instead becomes global hypotheses; in place.
+
+    Which of them it was those that come later may tell: whether it changed lanes far ahead, or the
+    road bends there.  All its courses from and to the same lanes are one by now.
+    """
+    for q in range(T.n):
+        if T.local[q].who != who:
+            continue
+        for p in range(q):
+            if T.local[p].who == who and alike(T, p, q):
+                merge_(T, p, q)
+                break
+    promote_(T, RARE, who)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def remove_guide_(T: Any, g: int) -> None:  # pragma: no cover - compiled
     """A vehicle is no longer followed; what it has shown of the road stays known."""
     T.party[g].slot = FREE
@@ -465,6 +509,7 @@ def remove_guide_(T: Any, g: int) -> None:  # pragma: no cover - compiled
         T.gone[k] += T.party[g].told[k]
         T.party[g].told[k] = 0.0
     T.party[g].ended[:] = 0.0
+    part_(T, g)
     drop_locals_(T, g)
     for a in range(first_state(T, g), first_state(T, g + 1)):
         T.x[a] = 0.0
