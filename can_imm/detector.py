@@ -418,7 +418,7 @@ class Detector:
             )  # fmt: skip
         if self._road is not None:
             self._road.judge_(self._id, self.reports, scan.t_ns)
-            hesitate_(self._id, self._memory, self._road.sure, self.reports, n)
+            hesitate_(self._id, self._memory, self._road.false_change, self.reports, n)
             relate_(self._id, self._memory, self.reports, n)
             self._road.globalise_(self.reports, n)
         return n

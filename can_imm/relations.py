@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numba
@@ -21,14 +20,14 @@ MEMORY_DTYPE = np.dtype(
         ("kept", np.int16),
         ("left", np.int16),
         ("changing", np.bool_),
-        ("belief", np.float64),
+        ("unsaid", np.float64),
     ],
     align=True,
 )
-"""What is remembered of a slot: ``changing`` a lane change was said of it, ``belief`` what speaks
-for one that was not said yet [s], ``told_ns`` when that was last looked at; ``kept`` the lane it
-kept last, ``left`` the lane that it left to the left at ``left_ns`` (lanes by number, `NO_LANE` for
-none); ``twin`` slot of an object that has been in the same place for ``twin_scans`` scans."""
+"""What is remembered of a slot: ``changing`` a lane change was said of it, ``unsaid`` what it
+has cost that one was not said yet [s], ``told_ns`` when that was last looked at; ``kept`` the lane
+it kept last, ``left`` the lane that it left to the left at ``left_ns`` (lanes by number, `NO_LANE`
+for none); ``twin`` slot of an object that has been in the same place for ``twin_scans`` scans."""
 
 LONGEST_NS = 100_000_000
 """What was said counts for no longer than this [ns]."""
@@ -39,8 +38,6 @@ AHEAD_M, BEHIND_M, FASTER = 40.0, 10.0, 0.5
 TWIN_M, TWIN_WIDTH_M, TWIN_SPEED = 3.0, 1.0, 1.0
 """No two vehicles are so near along and across the road [m] at the same speed [m/s]."""
 TWIN_SCANS = 3
-SUREST = 1.0 - 1e-9
-"""A greater probability counts as this one."""
 
 _LANE_CHANGE = int(Manoeuvre.LANE_CHANGE)
 _STATIONARY = int(Manoeuvre.STATIONARY)
@@ -49,15 +46,19 @@ _ONCOMING = int(Manoeuvre.ONCOMING)
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def hesitate_(
-    ids: Any, memory: Any, sure: float, reports: Any, n: int
+    ids: Any, memory: Any, price: float, reports: Any, n: int
 ) -> None:  # pragma: no cover - compiled
-    """Say that a lane change has begun only when that is sure, in place.
+    """Say that a lane change has begun only when that pays, in place.
 
     Most of what is a lane change by a narrow margin or for a moment is none: a vehicle wanders in
-    its lane, or one measurement is far off.  So the logarithm of its odds is summed up over the
-    time, as in a cumulative sum test (Page, 1954).  Until the sum is ``sure`` [s] the second most
-    probable manoeuvre is said; a lane change that was said stays until another manoeuvre is more
-    probable.  Other arguments as for `relate_`.
+    its lane, or one measurement is far off.  One that is said and does not take place counts as
+    much as ``price`` seconds of another wrong manoeuvre, so to say it costs that times the
+    probability that it does not.  Not to say it costs, as long as the second most probable
+    manoeuvre is said instead, what that is less probable by.  It is said when the latter sum has
+    reached the former, as somebody who does not know how long he will ski buys skis when he has
+    paid their price in rent (A. R. Karlin et al., "Competitive snoopy caching", Algorithmica 3,
+    1988).  One that was said stays until another manoeuvre is more probable.  Other arguments as
+    for `relate_`.
     """
     k = 0
     for s in range(ids.shape[0]):
@@ -69,16 +70,15 @@ def hesitate_(
         m.told_ns = report.t_ns
         if report.age <= 1:
             m.changing = False
-            m.belief = dt = 0.0
+            m.unsaid = dt = 0.0
         changing = report.manoeuvre == _LANE_CHANGE
         if not changing or m.changing:
-            m.belief = 0.0
+            m.unsaid = 0.0
         else:
-            p = min(report.probability, SUREST)
-            m.belief = max(m.belief + math.log(p / (1.0 - p)) * dt, 0.0)
-            if m.belief < sure:
+            p = report.probability
+            m.unsaid += (p - report.second_probability) * dt
+            if m.unsaid < price * (1.0 - p):
                 changing = False
-                p = report.probability
                 report.manoeuvre, report.second = report.second, report.manoeuvre
                 report.probability = report.second_probability
                 report.second_probability = p

@@ -78,9 +78,9 @@ class RoadFrame:
         return float(self.x[road.WIDTH])
 
     @property
-    def sure(self) -> float:
-        """How much must speak for a lane change before it is said; see `relations.hesitate_`."""
-        return float(self._par[road.P_SURE])
+    def false_change(self) -> float:
+        """What a false lane change costs [s]; see `relations.hesitate_`."""
+        return float(self._par[road.P_FALSE_CHANGE])
 
     def _begin(self, t: float, width: float, width_var: float) -> None:
         """Forget all but the lanes' width."""

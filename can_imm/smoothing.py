@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from can_imm.estimation.entry import entry_point
-from can_imm.estimation.road import N_ROAD, P_SETTLE, P_SURE
+from can_imm.estimation.road import N_ROAD, P_FALSE_CHANGE, P_SETTLE
 from can_imm.estimation.smoother import smooth_
 from can_imm.estimation.smoother_pairs import SMOOTHER_DTYPE
 from can_imm.hindsight import LOOK_AHEAD_S, Hindsight
@@ -114,7 +114,7 @@ class _Smoother:
         self._pending: deque[_Scan] = deque()
         self._shift = 0.0
         self._hindsight: Hindsight | None = None
-        # parameters of the road, where lane changes are no surer than to the detector
+        # parameters of the road, where lane changes are said as the detector does
         self._road: FloatArray | None = None
         self._work = np.zeros(1, SMOOTHER_DTYPE)
         self._out: Reports = np.zeros(64, REPORT_DTYPE)
@@ -237,7 +237,7 @@ class _Smoother:
                 judge_changes_(scan.changes, reports, n)
                 if not math.isnan(scan.acceleration):
                     judge_ramps_(scan.acceleration, reports, n)
-                hesitate_(self._ids, self._memory, self._road[P_SURE], reports, n)
+                hesitate_(self._ids, self._memory, self._road[P_FALSE_CHANGE], reports, n)
             relate_(self._ids, self._memory, reports, n)
             globalise_(scan.road, self._h, reports, n, scan.ego_speed)
         return scan.now * self._step_ns, reports

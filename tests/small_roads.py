@@ -23,7 +23,7 @@ USUAL = {
     "error_weight": 3.0, "error_most": 0.5, "speed_error_weight": 10.0, "speed_error_most": 2.0,
     "beside_std": 0.25, "beside_spread": 0.5, "beside_spread_all": 0.0,
     "beside_margin": 1.0, "beside_rate": 0.5, "change_rate": 0.03, "change_steady": 0.1,
-    "settle": 1.0, "sure": 0.5,
+    "settle": 1.0, "false_change": 0.5,
 }  # fmt: skip
 
 

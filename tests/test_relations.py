@@ -63,7 +63,7 @@ def changing(direction: int, lane: int, **what: Any) -> dict[str, Any]:
 # ---- when a lane change is said
 
 
-def test_a_lane_change_is_said_when_it_is_sure_and_until_it_is_over() -> None:
+def test_a_lane_change_is_said_when_that_pays_and_until_it_is_over() -> None:
     memory, ids = np.zeros(3, MEMORY_DTYPE), np.array([-1, 4, 5], np.int32)
 
     def said(p: float, age: int = 9, dt: float = 0.1) -> tuple[int, int, int]:
@@ -74,29 +74,30 @@ def test_a_lane_change_is_said_when_it_is_sure_and_until_it_is_over() -> None:
         reports["probability"], reports["second_probability"] = max(p, 1 - p), min(p, 1 - p)
         reports[0]["manoeuvre"], reports[0]["second"] = KEEP, Manoeuvre.RECEDING
         reports["t_ns"] = memory["told_ns"][1] + round(dt * S)
-        hesitate_(ids, memory, 0.15, reports, 2)
+        hesitate_(ids, memory, 1.0, reports, 2)
         assert reports[0]["manoeuvre"] == KEEP
         one = reports[1]
         assert one["probability"] == pytest.approx(p if one["manoeuvre"] == CHANGE else 1 - p)
         assert one["second_probability"] == pytest.approx(1 - one["probability"])
         return one["manoeuvre"], one["second"], one["direction"]
 
-    assert said(0.7) == (KEEP, CHANGE, 0), "not yet"
-    assert said(0.66) == (CHANGE, KEEP, -1), "odds of 2.33 and 1.94: the logarithms make 1.51"
+    assert said(0.8) == (KEEP, CHANGE, 0), "to say it costs 0.2 s, not to say it 0.06 s"
+    assert said(0.9) == (CHANGE, KEEP, -1), "0.1 s, and now 0.06 + 0.08 s"
     assert said(0.51) == (CHANGE, KEEP, -1), "still"
     assert said(0.49)[0] == KEEP
-    assert said(0.6)[0] == KEEP, "that would be another one"
+    assert said(0.9)[0] == KEEP, "that would be another one, 0.1 s and 0.08 s"
     assert said(0.4)[0] == KEEP
-    assert said(0.7)[0] == KEEP, "it was something else meanwhile"
-    assert said(0.79)[0] == CHANGE
+    assert said(0.9)[0] == KEEP, "it was something else meanwhile"
+    assert said(0.9)[0] == CHANGE
     assert said(0.2)[0] == KEEP
-    assert said(0.82)[0] == CHANGE, "sure at once"
-    assert said(0.9, age=1)[0] == KEEP, "another object in this slot"
-    assert said(1.0)[0] == CHANGE
+    assert said(0.92)[0] == CHANGE, "0.08 s and 0.084 s: at once"
+    assert said(0.95, age=1)[0] == KEEP, "another object in this slot"
+    assert said(0.9)[0] == KEEP, "of which nothing was held back before"
+    assert said(0.9)[0] == CHANGE
     assert said(0.2)[0] == KEEP
-    assert [said(0.75, dt=0.05)[0] for _ in range(3)] == [KEEP, KEEP, CHANGE], "twice as often"
+    assert [said(0.85, dt=0.05)[0] for _ in range(5)] == 4 * [KEEP] + [CHANGE], "twice as often"
     assert said(0.2)[0] == KEEP
-    assert said(0.75, dt=0.6)[0] == KEEP, "who was not heard for long is not surer"
+    assert said(0.85, dt=0.6)[0] == KEEP, "0.15 s: who was not heard for long counts 0.1 s"
 
 
 # ---- lanes

@@ -63,7 +63,7 @@ def test_making_one_leaves_the_road_as_it_is() -> None:
     np.testing.assert_array_equal(frame.x, x)
     np.testing.assert_array_equal(frame.P, P)
     assert frame.width == 3.5
-    assert frame.sure == 0.5
+    assert frame.false_change == 0.5
     assert math.isnan(frame.speed + frame.yaw_rate + frame.acceleration)
 
 

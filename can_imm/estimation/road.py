@@ -68,7 +68,7 @@ PARAMETERS = (
     "change_rate",
     "change_steady",
     "settle",
-    "sure",
+    "false_change",
 )
 """Names of the parameters, in their order in the array.
 
@@ -86,7 +86,8 @@ For `estimation.traffic`: ``beside_std`` [m] of a vehicle's place beside its cou
 to drive, ``beside_margin``: what was learnt of it counts times this, ``beside_rate`` [1/s]: how
 fast such a place is forgotten; ``change_rate`` [1/s] of lane changes, ``change_steady``: how
 probable it is that those of a drive are at a constant rate before any was seen, ``settle`` [s]: so
-long after it a lane change may still turn out to be none; ``sure``: see `relations.hesitate_`.
+long after it a lane change may still turn out to be none; ``false_change`` [s]: what one that is
+said and does not take place costs, see `relations.hesitate_`.
 """
 (
     P_WIDTH, P_WIDTH_STD, P_OFFSET, P_OFFSET_STD, P_OFFSET_TIME, P_HEADING_STD, P_HEADING_TIME,
@@ -94,7 +95,7 @@ long after it a lane change may still turn out to be none; ``sure``: see `relati
     P_YAW_NOISE, P_YAW_NOISE_UNKNOWN, P_DRIFT, P_ERROR_WEIGHT, P_ERROR_MOST,
     P_SPEED_ERROR_WEIGHT, P_SPEED_ERROR_MOST, P_BESIDE_STD, P_BESIDE_SPREAD,
     P_BESIDE_SPREAD_ALL, P_BESIDE_MARGIN, P_BESIDE_RATE,
-    P_CHANGE_RATE, P_CHANGE_STEADY, P_SETTLE, P_SURE,
+    P_CHANGE_RATE, P_CHANGE_STEADY, P_SETTLE, P_FALSE_CHANGE,
 ) = range(len(PARAMETERS))  # fmt: skip
 
 USUAL_SPEED = 25.0
