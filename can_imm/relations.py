@@ -132,7 +132,10 @@ def relate_(ids: Any, memory: Any, reports: Any, n: int) -> None:  # pragma: no 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def _remember_lane_(m: Any, report: Any) -> None:  # pragma: no cover - compiled
-    """Which lane the object kept, and the flags of a lane change."""
+    """Which lane the object kept, and the flags of a lane change.
+
+    While a lane change is held back by `hesitate_` the lane that was kept before it counts.
+    """
     if report.age <= 1:
         m.kept = NO_LANE
         m.left = NO_LANE
@@ -141,6 +144,8 @@ def _remember_lane_(m: Any, report: Any) -> None:  # pragma: no cover - compiled
     if report.manoeuvre == _STATIONARY or report.manoeuvre == _ONCOMING:
         return
     if report.manoeuvre != _LANE_CHANGE:
+        if m.unsaid > 0.0 and m.kept != NO_LANE:
+            return
         if m.kept != NO_LANE and report.lane > m.kept:
             m.left = m.kept
             m.left_ns = report.t_ns

@@ -116,6 +116,20 @@ def test_the_lane_that_an_object_kept() -> None:
     assert (road.memory[0]["kept"], road.memory[0]["left"]) == (1, NO_LANE)
 
 
+def test_who_is_said_late_to_change_lanes_leaves_the_lane_it_was_in_before() -> None:
+    """It may have crossed the line by then."""
+    road = Road()
+    road.scan({0: at(0), 1: at(1)})
+    road.memory["unsaid"][:2] = 0.05
+    reports = road.scan({0: at(-1), 1: at(0)})
+    assert [reports[s]["flags"] for s in (0, 1)] == [0, 0]
+    reports = road.scan({0: changing(-1, -1), 1: changing(-1, 0)})
+    assert [reports[s]["flags"] for s in (0, 1)] == [CUT_OUT, CUT_IN]
+    road.memory["unsaid"] = 0.0
+    road.scan({0: at(-1), 1: at(0)})
+    assert road.memory["kept"][:2].tolist() == [-1, 0]
+
+
 @pytest.mark.parametrize("other", [Manoeuvre.STATIONARY, Manoeuvre.ONCOMING])
 def test_who_does_not_drive_along_keeps_no_lane(other: Manoeuvre) -> None:
     road = Road()
