@@ -53,11 +53,11 @@ def hesitate_(
     Most of what is a lane change by a narrow margin or for a moment is none: a vehicle wanders in
     its lane, or one measurement is far off.  One that is said and does not take place counts as
     much as ``price`` seconds of another wrong manoeuvre, so to say it costs that times the
-    probability that it does not.  Not to say it costs, as long as the second most probable
-    manoeuvre is said instead, what that is less probable by.  It is said when the latter sum has
-    reached the former, as somebody who does not know how long he will ski buys skis when he has
-    paid their price in rent (A. R. Karlin et al., "Competitive snoopy caching", Algorithmica 3,
-    1988).  One that was said stays until another manoeuvre is more probable.  Other arguments as
+    probability that it does not.  Not to say it costs, over the time, by how much less probable the
+    second most probable manoeuvre is, which is said instead.  It is said when this has added up to
+    that, as somebody who does not know for how long he will ski buys skis when the rent paid has
+    reached their price (A. R. Karlin et al., "Competitive snoopy caching", Algorithmica 3, 1988).
+    One that was said stays until another manoeuvre is more probable.  Other arguments as
     for `relate_`.
     """
     k = 0

@@ -488,8 +488,8 @@ def consider_(T: Any, t: float, par: FloatArray) -> None:  # pragma: no cover - 
 def part_(T: Any, who: int) -> None:  # pragma: no cover - compiled
     """What a party that leaves may have done instead becomes global hypotheses; in place.
 
-    Which of them it was those that come later may tell: whether it changed lanes far ahead, or the
-    road bends there.  All its courses from and to the same lanes are one by now.
+    Those that come there later may tell which it was: whether it changed lanes far ahead, or the
+    road bends there.  Courses from and to the same lanes are made one first, with the odds of all.
     """
     for q in range(T.n):
         if T.local[q].who != who:
