@@ -41,8 +41,6 @@ EGO_DTYPE = np.dtype(
 `estimation.road`; ``shift`` by how much the ego's lane has moved to the left since the beginning
 [m]; ``journey`` number of the stretch without long silences."""
 
-MOST_BIAS = 0.004
-"""Largest error of the ego's yaw rate that is believed [rad/s]."""
 BESIDE = 0.35
 """Standard deviation of vehicles' places beside the middle of their lanes [m]."""
 DRIFT = 0.0035
@@ -136,8 +134,7 @@ class RoadDriven:
         self._cov = cov
         self._mounting = float(ego["x"][-1, MOUNTING])
         pose = np.zeros((len(ego), 3))
-        bias = min(max(float(ego["x"][-1, BIAS]), -MOST_BIAS), MOST_BIAS)
-        reckon_(ego["t"].copy(), speed, ego["yaw_rate"] - bias, pose)
+        reckon_(ego["t"].copy(), speed, ego["yaw_rate"] - ego["x"][-1, BIAS], pose)
         self._pose = pose
         offset = (ego["x"][:, OFFSET] + ego["shift"])[:, None]
         line = pose[:, :2] + offset * np.stack([np.sin(pose[:, 2]), -np.cos(pose[:, 2])], axis=1)

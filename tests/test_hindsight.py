@@ -35,7 +35,7 @@ SPEED, PERIOD, LANE = 30.0, 0.07, 3.6
 class Drive:
     """An ego that wanders in its lane on a road that begins to bend 150 m ahead."""
 
-    def __init__(self, seconds: float = 14.0) -> None:
+    def __init__(self, seconds: float = 14.0, bias: float = 0.002) -> None:
         station = np.array([-300.0, 150.0, 300.0, 2000.0])
         self.road = Road.of(station, np.array([0.0, 0.0, 0.001, 0.001]))
         self.t = np.arange(0.0, seconds, PERIOD)
@@ -53,8 +53,8 @@ class Drive:
             frame.x[:] = 0.0
             frame.x[[OFFSET, HEADING]] = self.d[k], self.slope[k]
             frame.x[KNOT:] = curvature[k]
-            frame.x[[BIAS, MOUNTING, WIDTH]] = 0.002, 0.0, LANE
-            frame.speed, frame.yaw_rate = SPEED, float(yaw_rate[k]) + 0.002
+            frame.x[[BIAS, MOUNTING, WIDTH]] = bias, 0.0, LANE
+            frame.speed, frame.yaw_rate = SPEED, float(yaw_rate[k]) + bias
             self.history.add(float(t), frame, 0.0)
 
     def seen(self, k: int, ahead: float, d: float) -> FloatArray:
@@ -76,9 +76,11 @@ class Drive:
         )  # fmt: skip
 
 
-def test_the_road_is_where_the_ego_drives_later() -> None:
-    """120 m ahead, in the left lane, into a bend of which nothing is seen yet."""
-    drive = Drive()
+@pytest.mark.parametrize("bias", [0.002, -0.008])
+def test_the_road_is_where_the_ego_drives_later(bias: float) -> None:
+    """120 m ahead, in the left lane, into a bend of which nothing is seen yet.  What is wrong with
+    the yaw rate is known."""
+    drive = Drive(bias=bias)
     ego = drive.history.journey(0, len(drive.t) - 1, 0.0)
     scan = np.arange(0, 100, 5)
     z = np.array([drive.seen(int(k), 120.0, LANE) for k in scan])
