@@ -243,14 +243,8 @@ def settle_(T: Any, who: int, t: float, par: FloatArray) -> None:  # pragma: no 
             if total != total:
                 total = total_odds(T, best, who)
             ended[1 if one.steady else 0] += math.exp(T.odds[best, q] - total)
-        if one.turn != 0:
-            continue
-        for p in range(q):
-            other = T.local[p]
-            if other.who == who and other.turn == 0 and other.lane == one.lane:
-                merge_(T, p, q)
-                total = np.nan  # odds count from what is chosen
-                break
+        if one.turn == 0 and merge_alike_(T, q):
+            total = np.nan  # odds count from what is chosen
     if ended[0] + ended[1] >= ONE_ENDED:
         learn_habit_(T, who, par)
 
@@ -271,6 +265,17 @@ def merge_(T: Any, p: int, q: int) -> None:  # pragma: no cover - compiled
             T.choice[g, who] = p
         if T.choice[g, who] == p:
             rechoose_(T, g, who, p)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def merge_alike_(T: Any, q: int) -> bool:  # pragma: no cover - compiled
+    """The first course of a party that leads from and to the same lanes as q takes q in, if there
+    is one before q; returns whether there is."""
+    for p in range(q):
+        if T.local[p].who == T.local[q].who and alike(T, p, q):
+            merge_(T, p, q)
+            return True
+    return False
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -383,8 +388,8 @@ def promote_(T: Any, least: float, of: int) -> None:  # pragma: no cover - compi
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def drop_globals_(T: Any) -> None:  # pragma: no cover - compiled
-    """Give up the unlikely global hypotheses, and the second of two alike; logarithms of weights
-    count from the best one; in place."""
+    """Give up the unlikely global hypotheses, and the second of two alike on the same road;
+    logarithms of weights count from the best one; in place."""
     best = T.log_w[best_global(T)]
     kept = 0
     for g in range(T.n_global):
@@ -492,12 +497,8 @@ def part_(T: Any, who: int) -> None:  # pragma: no cover - compiled
     road bends there.  Courses from and to the same lanes are made one first, with the odds of all.
     """
     for q in range(T.n):
-        if T.local[q].who != who:
-            continue
-        for p in range(q):
-            if T.local[p].who == who and alike(T, p, q):
-                merge_(T, p, q)
-                break
+        if T.local[q].who == who:
+            merge_alike_(T, q)
     promote_(T, RARE, who)
 
 

@@ -744,17 +744,16 @@ def test_of_the_global_hypotheses_the_unlikely_are_given_up(seed: int) -> None:
         np.testing.assert_array_equal(T["odds"][to, :n], before["odds"][g, :n])
 
 
-def everything(T: Any, without: int = -1) -> list[dict[Any, Any]]:
+def everything(T: Any) -> list[dict[Any, Any]]:
     """Of each global hypothesis: its mean, and by course how probable that would be."""
     said = []
     for g in range(T["n_global"]):
         one: dict[Any, Any] = {}
         for q in range(T["n"]):
             course = T["local"][q]
-            if course["who"] != without:
-                chosen = bool(T["choice"][g, course["who"]] == q)
-                key = (course.tobytes(), T["mean"][q, :N_ROAD].tobytes())
-                one[key] = T["log_w"][g] + T["odds"][g, q], chosen
+            chosen = bool(T["choice"][g, course["who"]] == q)
+            key = (course.tobytes(), T["mean"][q, :N_ROAD].tobytes())
+            one[key] = T["log_w"][g] + T["odds"][g, q], chosen
         said.append(one)
     return said
 
